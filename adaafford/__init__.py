@@ -1,0 +1,1 @@
+"""Affordance that adapts to one articulated object after a few tries: the public face."""

@@ -1,0 +1,1 @@
+"""The command line, the Ray session, the campaign (the alternation), reports."""

@@ -1,0 +1,1 @@
+"""Procedural objects in PartNet-Mobility's layout, so that a fresh machine needs no data set."""

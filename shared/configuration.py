@@ -1,0 +1,176 @@
+"""Configuration models, one a concern, every default in one place; TOML files and flags are read through them."""
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from shared.errors import UsageError
+from shared.vocabulary import Order, Primitive
+
+MAX_CONFIGURATION_BYTES = 1 << 20
+
+
+class StrictModel(BaseModel):
+    """A frozen model that refuses settings it does not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Range(StrictModel):
+    """An interval to draw from."""
+
+    low: float
+    high: float
+    log: bool = False
+    """Uniform in the logarithm instead of the value."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Range":
+        if self.low > self.high or (self.log and self.low <= 0):
+            raise ValueError(f"needs low <= high, and low > 0 where log is set; given {self.low} to {self.high}")
+        return self
+
+
+class CameraConfig(StrictModel):
+    """The depth camera (protocol of Where2Act; the azimuth is narrowed to the side that doors face)."""
+
+    image_size: int = Field(448, ge=32, le=4096)
+    """Width and height, pixels."""
+    field_of_view_deg: float = Field(35.0, gt=1, lt=120)
+    """Vertical field of view."""
+    distance: float = Field(5.0, gt=0)
+    """From the object's origin, which it looks at."""
+    azimuth_deg: Range = Range(low=135.0, high=225.0)
+    """PartNet-Mobility objects face -x, which is 180 deg. Where2Act: 0 to 360; AdaAfford: 181."""
+    elevation_deg: Range = Range(low=30.0, high=60.0)
+    points: int = Field(2048, ge=64, le=16384)
+    """N, kept by furthest-point sampling. As published: 10,000."""
+    candidates: int = Field(30_000, ge=64)
+    """Hit pixels drawn at random before furthest-point sampling, as published."""
+
+    @model_validator(mode="after")
+    def _enough_candidates(self) -> "CameraConfig":
+        if self.candidates < self.points:
+            raise ValueError(f"candidates ({self.candidates}) must be at least points ({self.points})")
+        return self
+
+
+class Fidelity(StrictModel):
+    """How finely a trial is simulated; `fast` agrees with `reference`, the published timing, on labels."""
+
+    name: str = "fast"
+    steps_per_second: int = Field(240, ge=60, le=2000)
+    leg_steps: int = Field(480, ge=1)
+    """Steps of one leg of a primitive."""
+    hold_steps: int = Field(240, ge=0)
+    """Steps of hold after a leg."""
+    solver_iterations: int = Field(20, ge=1, le=255)
+
+
+FIDELITIES = {
+    "fast": Fidelity(),
+    "reference": Fidelity(name="reference", steps_per_second=500, leg_steps=2000, hold_steps=2000),
+}
+
+
+class DynamicsRanges(StrictModel):
+    """What hidden dynamics are drawn from (see `shared.vocabulary.HiddenDynamics` for units)."""
+
+    part_mass: Range = Range(low=0.05, high=0.5, log=True)
+    joint_friction: Range = Range(low=0.02, high=2.0)
+    surface_friction: Range = Range(low=0.1, high=4.0, log=True)
+
+
+class RolloutConfig(StrictModel):
+    """What one rollout consists of."""
+
+    interactions: int = Field(32, ge=1, le=4096)
+    """As published: 32 for each object and draw of hidden dynamics."""
+    order: Order = Order.RESTART
+    """Order of the random interactions; those of AIP always continue, and come first."""
+    actions_per_state: int = Field(8, ge=1)
+    """Restart order: actions tried from one observed state."""
+    context: int = Field(4, ge=0)
+    """How many interactions, at the most, AIP proposes at the start of a rollout in rounds that use it."""
+
+
+class CollectionConfig(StrictModel):
+    """How interactions are collected, apart from which objects, how many, and by whom."""
+
+    primitive: Primitive | None = None
+    """Instead of the task's own primitive."""
+    camera: CameraConfig = CameraConfig()
+    fidelity: Fidelity = Fidelity()
+    dynamics: DynamicsRanges | None = None
+    """Instead of the task's own ranges."""
+    rollout: RolloutConfig = RolloutConfig()
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def parse(model: type[Model], values: dict[str, Any], source: str) -> Model:
+    """Validate `values` as `model`.
+
+    Raises:
+        UsageError: with one line that names `source`, the setting, what was given and what is allowed.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise UsageError(f"{source}: {_first_problem(model, error)}") from None
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file of settings.
+
+    Raises:
+        UsageError: the file is missing, too large, or not TOML.
+    """
+    try:
+        if path.stat().st_size > MAX_CONFIGURATION_BYTES:
+            raise UsageError(f"{path}: larger than {MAX_CONFIGURATION_BYTES} bytes; not a configuration file")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read ({error.strerror}); name an existing TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: not valid TOML ({error})") from None
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`base` with the settings of `over` laid over it, table by table."""
+    merged = dict(base)
+    for key, value in over.items():
+        old = merged.get(key)
+        merged[key] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
+    """One line for the first thing that is wrong, with the likely spelling of an unknown setting."""
+    problems = error.errors()
+    problem = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
+    location = [str(part) for part in problem["loc"]]
+    name = ".".join(location) or "the file"
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    if problem["type"] == "extra_forbidden":
+        known = sorted(_fields_at(model, location[:-1]))
+        close = difflib.get_close_matches(location[-1], known, n=1)
+        hint = f"did you mean '{close[0]}'?" if close else f"allowed here: {', '.join(known)}"
+        return f"unknown setting '{name}'; {hint}{more}"
+    return f"setting '{name}': {problem['msg']}; given {str(problem['input'])[:80]!r}{more}"
+
+
+def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
+    """Names of the settings below `location`."""
+    here: Any = model
+    for part in location:
+        annotation = here.model_fields[part].annotation if part in here.model_fields else None
+        options = [annotation, *getattr(annotation, "__args__", ())]
+        here = next((o for o in options if isinstance(o, type) and issubclass(o, BaseModel)), None)
+        if here is None:
+            return []
+    return list(here.model_fields)

@@ -1,0 +1,88 @@
+"""Frames and rotations. Matrices are written target_from_source and act on columns.
+
+The *view* frame is where networks work: the world turned about z so that the camera looks along +x, origin kept at the
+object's. It keeps gravity pointing down and forgets the azimuth, which carries no information.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.vocabulary import Float, Observation
+
+
+def camera_pose(azimuth_deg: float, elevation_deg: float, distance: float) -> Float:
+    """world_from_camera, [4, 4], of a camera that looks at the origin: x forward, y left, z up.
+
+    Args:
+        azimuth_deg: of the camera's place about z, from +x.
+        elevation_deg: of the camera's place above the horizon, in (-90, 90).
+        distance: from the origin.
+    """
+    azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
+    place = distance * np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    forward = -place / np.linalg.norm(place)
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    left /= np.linalg.norm(left)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = forward, left, np.cross(forward, left), place
+    return pose
+
+
+def view_from_world(world_from_camera: Float) -> Float:
+    """The rotation [3, 3] into the view frame of a camera.
+
+    Where the camera looks straight down its own *up* direction stands in for forward.
+    """
+    forward = world_from_camera[:3, 0]
+    if np.hypot(forward[0], forward[1]) < 1e-6:
+        forward = world_from_camera[:3, 2]
+    cos, sin = forward[:2] / np.hypot(forward[0], forward[1])
+    return np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def points_in_view(observation: Observation) -> NDArray[np.float32]:
+    """The observation's cloud in the view frame, [N, 3]."""
+    rotation = view_from_world(observation.world_from_camera)
+    return (observation.points @ rotation.T.astype(np.float32)).astype(np.float32)
+
+
+def gripper_rotation(approach: Float, roll_reference: Float) -> Float:
+    """R = [forward, left, up], [3, 3], with *up* the approach direction.
+
+    Args:
+        approach: [3], unit.
+        roll_reference: [3], any vector not parallel to `approach`; *forward* is its part normal to `approach`.
+    """
+    left = np.cross(approach, roll_reference)
+    left /= np.linalg.norm(left)
+    return np.stack([np.cross(left, approach), left, approach], axis=1)
+
+
+def quaternion_from_rotation(rotation: Float) -> Float:
+    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix [3, 3]."""
+    m = rotation
+    # Bar-Itzhack: the dominant eigenvector is stable for every rotation, unlike the four-case formulas.
+    k = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
+        ]
+    )
+    quaternion = np.linalg.eigh(k)[1][:, -1]
+    return quaternion if quaternion[0] >= 0 else -quaternion
+
+
+def rotation_from_quaternion(quaternion: Float) -> Float:
+    """Rotation matrix [3, 3] of a quaternion (w, x, y, z) of any non-zero length."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,1 @@
+"""The networks of the paper, shared by the actors (proposals) and the learner (training)."""

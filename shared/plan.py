@@ -1,0 +1,89 @@
+"""Plans: pure functions from configuration and seed to numbered rollouts.
+
+A *setting* fixes everything that makes rows comparable; a store holds one. A *plan* adds who proposes. A *job* is a
+range of a plan's rollouts and makes one *shard*. Nothing here knows who does the work, or when.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import Field
+
+from shared.configuration import CollectionConfig, StrictModel
+
+
+class ObjectRef(StrictModel):
+    """One object, by its identity and by the hash of the files that define it."""
+
+    id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
+    category: str
+    content_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
+
+
+class EvaluationConfig(StrictModel):
+    """What is tried on each test object."""
+
+    methods: tuple[str, ...] = ("where2act", "ours-random", "ours-final")
+    budgets: tuple[int, ...] = (1, 2, 4)
+    queries: int = Field(24, ge=1)
+    """Random test interactions a rollout, which critics are asked about (F-score)."""
+
+
+class Setting(StrictModel):
+    """What all rows of one store have in common."""
+
+    kind: Literal["collection", "evaluation"] = "collection"
+    task: str
+    seed: int = Field(ge=0)
+    objects: tuple[ObjectRef, ...] = Field(min_length=1)
+    collection: CollectionConfig
+    evaluation: EvaluationConfig | None = None
+
+
+class Plan(StrictModel):
+    """A setting, and who proposes the interactions."""
+
+    setting: Setting
+    proposer: str = Field("random", pattern=r"^[a-z][a-z0-9-]{0,30}$")
+    policy_version: int = Field(0, ge=0)
+    """The policy that the proposer uses; 0 is no policy at all."""
+
+    @property
+    def key(self) -> str:
+        """Name of the plan within its store, such as "random-v0"."""
+        return f"{self.proposer}-v{self.policy_version}"
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Rollouts `start` (included) to `stop` (not included) of a plan."""
+
+    plan_key: str
+    start: int
+    stop: int
+
+    @property
+    def shard_id(self) -> str:
+        """The shard that the job makes."""
+        return f"{self.plan_key}-{self.start:08d}-{self.stop:08d}"
+
+
+def missing_jobs(plan_key: str, rollouts: int, done: list[tuple[int, int]], per_shard: int) -> list[Job]:
+    """Jobs for the rollouts in [0, `rollouts`) that no committed range in `done` covers.
+
+    Args:
+        plan_key: the plan.
+        rollouts: how many are wanted in all.
+        done: committed half-open ranges; they do not overlap.
+        per_shard: the most rollouts that one job may hold.
+    """
+    gaps, start = [], 0
+    for low, high in sorted(done):
+        gaps.append((start, min(low, rollouts)))
+        start = max(start, high)
+    gaps.append((start, rollouts))
+    return [
+        Job(plan_key, first, min(first + per_shard, stop))
+        for begin, stop in gaps
+        for first in range(begin, stop, per_shard)
+    ]

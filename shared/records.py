@@ -1,0 +1,84 @@
+"""Records: an executed rollout as the collector hands it to the store, with all that a replay needs."""
+
+from dataclasses import dataclass
+
+from shared.plan import ObjectRef
+from shared.vocabulary import Action, Float, HiddenDynamics, Observation, Order, Outcome, Primitive, Role
+
+
+@dataclass(frozen=True, slots=True)
+class InteractionRecord:
+    """One row: enough to replay the interaction alone, and what happened.
+
+    Attributes:
+        step: number within the rollout.
+        observation: index into `RolloutRecord.observations`.
+        action: p and R, world frame.
+        outcome: what came of it.
+        normal: [3], world frame, surface normal at p.
+        primitive: what was executed.
+        order: whether the next interaction starts from the same state or from where this one ended.
+        role: what the interaction is for.
+        proposer: who chose the action.
+        policy_version: the policy that it used; 0 for none.
+        method: evaluation only: whose context or exploit it is, else "".
+        budget: evaluation only: how many tries came before an exploit, else -1.
+        target_part: 1-based movable part that p lies on.
+        target_link: its link's name in the URDF.
+        target_joint: its joint's name in the URDF.
+        joint_positions: of all movable joints at the start, in part order.
+        joint_limits: [parts, 2], limits that were in force (the direction modes change them).
+        hand_start: [7], world pose of the hand frame at the start, xyz then quaternion wxyz.
+        seconds: wall time; not part of the content digest.
+    """
+
+    step: int
+    observation: int
+    action: Action
+    outcome: Outcome
+    normal: Float
+    primitive: Primitive
+    order: Order
+    role: Role
+    proposer: str
+    policy_version: int
+    method: str
+    budget: int
+    target_part: int
+    target_link: str
+    target_joint: str
+    joint_positions: Float
+    joint_limits: Float
+    hand_start: Float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutRecord:
+    """One object, one draw of hidden dynamics, one camera, and a sequence of interactions.
+
+    Attributes:
+        index: number within the plan.
+        plan_key: the plan.
+        object: which object.
+        dynamics: the hidden draw.
+        azimuth_deg: of the camera.
+        elevation_deg: of the camera.
+        seed: the plan's seed, from which all of the rollout was drawn.
+        fidelity: name of the fidelity preset.
+        status: "ok", or why there are no interactions ("no-visible-part", "not-settled", "abandoned").
+        observations: each one once, however many actions were tried from it.
+        interactions: in the order they were executed.
+    """
+
+    index: int
+    plan_key: str
+    object: ObjectRef
+    dynamics: HiddenDynamics
+    azimuth_deg: float
+    elevation_deg: float
+    seed: int
+    fidelity: str
+    status: str
+    observations: tuple[Observation, ...]
+    interactions: tuple[InteractionRecord, ...]

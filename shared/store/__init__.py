@@ -1,0 +1,1 @@
+"""The store: immutable shards, each complete if and only if its manifest is there."""

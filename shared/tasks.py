@@ -1,0 +1,70 @@
+"""The paper's tasks: which primitive, on which parts, from which states, under which hidden dynamics."""
+
+from dataclasses import dataclass
+
+from shared.configuration import DynamicsRanges, Range
+from shared.errors import UsageError
+from shared.vocabulary import Direction, Primitive
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One manipulation task.
+
+    Attributes:
+        name: what flags and rows call it.
+        primitive: the gripper primitive that it executes.
+        categories: the only categories that it applies to; empty: all.
+        part_names: a movable part qualifies if its semantic name contains one of these; empty: all.
+        revolute_only: whether only turning joints qualify.
+        closed: whether every joint starts at its lower limit, instead of the published mixture of states.
+        directions: the modes that a rollout's `HiddenDynamics.direction` is drawn from.
+        dynamics: ranges of the hidden dynamics.
+    """
+
+    name: str
+    primitive: Primitive
+    categories: tuple[str, ...] = ()
+    part_names: tuple[str, ...] = ()
+    revolute_only: bool = False
+    closed: bool = False
+    directions: tuple[Direction, ...] = (Direction.AS_BUILT,)
+    dynamics: DynamicsRanges = DynamicsRanges()
+
+
+TASKS = {
+    task.name: task
+    for task in (
+        Task("push", Primitive.PUSH),
+        Task("pull", Primitive.PULL),
+        Task(
+            "pull-closed-door",
+            Primitive.PULL,
+            categories=("StorageFurniture", "Cabinet"),
+            part_names=("door",),
+            revolute_only=True,
+            closed=True,
+            dynamics=DynamicsRanges(joint_friction=Range(low=0.02, high=1.0)),
+        ),
+        Task(
+            "push-faucet",
+            Primitive.PUSH,
+            categories=("Faucet",),
+            part_names=("switch",),
+            revolute_only=True,
+            closed=True,
+            directions=(Direction.BOTH, Direction.CLOCKWISE, Direction.COUNTER_CLOCKWISE),
+        ),
+    )
+}
+
+
+def task_named(name: str) -> Task:
+    """The task called `name`.
+
+    Raises:
+        UsageError: there is no such task; the message lists those there are.
+    """
+    if name not in TASKS:
+        raise UsageError(f"unknown task '{name}'; allowed: {', '.join(TASKS)}")
+    return TASKS[name]

@@ -1,0 +1,207 @@
+"""The vocabulary: what crosses a boundary between the collector, the store, the learner and a robot.
+
+One loop serves collection, evaluation and a real robot:
+
+    observation = environment.observe()
+    action = proposer.propose(observation, history)      # None: the proposer has seen enough
+    outcome = environment.execute(action)
+    history.append(Interaction(observation, action, outcome))
+
+Frames. *World*: the object's root link at the origin, z up, SI units. *Camera*: x forward, y left, z up, at the
+camera's centre. *View*: the world turned about z until the camera looks along +x (see `shared.geometry`);
+networks see this frame.
+
+Shapes: N points of a cloud.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+
+class Primitive(StrEnum):
+    """The six gripper primitives of Where2Act; each is a pure translation of the hand."""
+
+    PUSH = "push"
+    PUSH_LEFT = "push-left"
+    PUSH_UP = "push-up"
+    PULL = "pull"
+    PULL_LEFT = "pull-left"
+    PULL_UP = "pull-up"
+
+    @property
+    def pulls(self) -> bool:
+        """Whether the fingers start open and close after the approach."""
+        return self.value.startswith("pull")
+
+
+class OutcomeKind(StrEnum):
+    """How a trial ended. Every kind but `ABANDONED` is an outcome of physics and so a label."""
+
+    OK = "ok"
+    """The primitive ran to its end; `Outcome.success` says whether it moved the part as intended."""
+    NO_CONTACT = "no-contact"
+    """It ran to its end and touched nothing."""
+    NO_GRASP = "no-grasp"
+    """A pull whose fingers closed on nothing (together open by at most 0.01)."""
+    START_COLLISION = "start-collision"
+    """The hand was in collision at the very first step."""
+    WRONG_PART = "wrong-part"
+    """A push whose finger first touched a part other than the target."""
+    HAND_CONTACT = "hand-contact"
+    """A push whose palm touched anything before or at the first contact."""
+    UNSTABLE = "unstable"
+    """The simulation diverged (not a number, or a joint far outside its limits)."""
+    ABANDONED = "abandoned"
+    """Infrastructure failed (a crash, a hang); says nothing of the action and is never a label."""
+
+    @property
+    def is_label(self) -> bool:
+        """Whether a learner may use the row."""
+        return self is not OutcomeKind.ABANDONED
+
+
+class Direction(StrEnum):
+    """Which ways a joint turns from where it starts; hidden from view ("pushing faucet" in the paper)."""
+
+    AS_BUILT = "as-built"
+    """The joint's own limits."""
+    BOTH = "both"
+    CLOCKWISE = "clockwise"
+    COUNTER_CLOCKWISE = "counter-clockwise"
+
+
+class Order(StrEnum):
+    """How the interactions of a rollout follow each other."""
+
+    RESTART = "restart"
+    """Several actions are tried from one observed state, which is restored before each."""
+    CONTINUE = "continue"
+    """Each interaction starts where the last one left the object (the paper's test time)."""
+
+
+class Role(StrEnum):
+    """What an interaction is for."""
+
+    COLLECT = "collect"
+    """Training data."""
+    QUERY = "query"
+    """A random test interaction that a critic is asked about (F-score)."""
+    CONTEXT = "context"
+    """A test-time try that fills the set of interactions."""
+    EXPLOIT = "exploit"
+    """The action that the adapted affordance chooses at the end (sample-success)."""
+
+
+@dataclass(frozen=True, slots=True)
+class HiddenDynamics:
+    """What cannot be seen, drawn once a rollout and applied to every movable part alike."""
+
+    part_mass: float
+    """Mass of a movable part, kg; its inertia is scaled along."""
+    joint_friction: float
+    """Coulomb friction of a movable joint: N m if it turns, N if it slides."""
+    surface_friction: float
+    """Friction coefficient between hand and object."""
+    direction: Direction = Direction.AS_BUILT
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """A partial cloud of one object from one camera, in furthest-point order: any prefix covers the object.
+
+    Points and normals are rounded to what the store keeps, so that a proposer sees what a learner will.
+    """
+
+    points: Float32
+    """[N, 3], world frame, exactly representable in float16."""
+    normals: Float32
+    """[N, 3], world frame, unit length up to rounding, facing the camera."""
+    part_ids: NDArray[np.uint8]
+    """[N], 0 for the static body, k for the k-th movable part (1-based)."""
+    movable: NDArray[np.bool_]
+    """[N], whether the task may act on the point."""
+    pixels: NDArray[np.uint32]
+    """[N], row * image width + column of the ray that hit the point."""
+    world_from_camera: Float
+    """[4, 4], rigid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """u = (p, R): where the gripper touches and how it is turned."""
+
+    point_index: int
+    """Index of p in the observation's cloud."""
+    point: Float
+    """p, [3], world frame."""
+    rotation: Float
+    """R, [3, 3], world frame; columns forward, left, up, where *up* is the approach direction."""
+
+    @property
+    def approach(self) -> Float:
+        """Approach direction d, [3], world frame."""
+        return self.rotation[:, 2]
+
+    @property
+    def forward(self) -> Float:
+        """Forward direction, [3], world frame."""
+        return self.rotation[:, 0]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of an action. A robot needs to fill only the first three fields."""
+
+    kind: OutcomeKind
+    motion: float
+    """m, how far the target joint moved: rad or length, never negative; 0 for a trial that was not valid."""
+    success: bool
+    """r, by the success rule of the primitive."""
+    start_joint_position: float = float("nan")
+    end_joint_position: float = float("nan")
+    displacement: Float = field(default_factory=lambda: np.full(3, np.nan))
+    """[3], world frame, of the touched point of the target part."""
+    grasp_opening: float = float("nan")
+    """How far both fingers together stayed open after closing; pulls only."""
+    steps: int = 0
+    """Physics steps simulated."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interaction:
+    """I = (O, p, R, m): one try and what was learnt from it."""
+
+    observation: Observation
+    action: Action
+    outcome: Outcome
+
+
+class Environment(Protocol):
+    """Anything that can be looked at and acted upon: a SAPIEN scene, or a real robot before a real door."""
+
+    def observe(self) -> Observation:
+        """Look at the object as it stands."""
+        ...
+
+    def execute(self, action: Action) -> Outcome:
+        """Try the action; a failure of physics is an outcome, not an exception."""
+        ...
+
+
+class Proposer(Protocol):
+    """Anything that chooses what to try next."""
+
+    name: str
+    """What rows call it: "random", "aip", ..."""
+
+    def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
+        """The next action, or None to stop."""
+        ...
