@@ -1,0 +1,32 @@
+"""How a cloud is rounded for keeping, so that a proposer sees exactly what a learner will read back.
+
+Points are kept as float16 (about 0.5 mm at 1 unit), normals as three signed bytes of 1/127 (within half a degree).
+Shapes: N points; any leading shape will do.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.vocabulary import Float, Float32
+
+NORMAL_STEPS = 127
+
+
+def round_points(points: Float | Float32) -> Float32:
+    """Points, [..., 3], at the nearest places that float16 can express."""
+    return points.astype(np.float16).astype(np.float32)
+
+
+def round_normals(normals: Float | Float32) -> Float32:
+    """Unit normals, [..., 3], with each component at the nearest multiple of 1/127."""
+    return unpack_normals(pack_normals(normals))
+
+
+def pack_normals(normals: Float | Float32) -> NDArray[np.int8]:
+    """Unit normals, [..., 3], as the signed bytes that are kept."""
+    return np.rint(np.clip(normals, -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
+
+
+def unpack_normals(packed: NDArray[np.int8]) -> Float32:
+    """The normals, [..., 3], that `pack_normals` kept."""
+    return packed.astype(np.float32) / np.float32(NORMAL_STEPS)
