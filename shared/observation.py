@@ -24,7 +24,8 @@ def round_normals(normals: Float | Float32) -> Float32:
 
 def pack_normals(normals: Float | Float32) -> NDArray[np.int8]:
     """Unit normals, [..., 3], as the signed bytes that are kept."""
-    return np.rint(np.clip(normals, -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
+    packed: NDArray[np.int8] = np.rint(np.clip(normals, -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
+    return packed
 
 
 def unpack_normals(packed: NDArray[np.int8]) -> Float32:
