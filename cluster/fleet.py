@@ -1,0 +1,132 @@
+"""Fleets: whoever executes the jobs of a plan. The serial one here, the Ray one in `cluster.ray_fleet`.
+
+    fleet.load_policy(1, files)                    # once a version
+    fleet.run(plan, jobs, on_receipt=print)        # any number of times, on the same live workers
+    fleet.close()
+
+Jobs are idempotent by their shard: a worker that finds its shard committed does nothing. So a job may be submitted
+again after any failure, and at-least-once delivery is enough.
+"""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+from shared.errors import AdaAffordError, WorkerError
+from shared.plan import Job, Plan
+
+if TYPE_CHECKING:
+    from collector.worker import Receipt
+
+MAX_ATTEMPTS = 3
+"""How often a job is tried before the run ends: once for its own sake, twice against bad luck of a machine."""
+
+logger = logging.getLogger(__name__)
+
+
+class Worker(Protocol):
+    """What a fleet needs of `collector.worker.Worker`."""
+
+    def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
+        """Make the policy `version` ready for plans that use it."""
+        ...
+
+    def run(self, plan: Plan, job: Job) -> "Receipt":
+        """Execute and commit `job`; do nothing if that was done before."""
+        ...
+
+
+WorkerFactory = Callable[[], Worker]
+"""Makes a worker in the process that will use it; must be picklable for a fleet of processes."""
+
+
+class JobFailure(WorkerError):
+    """A job failed as often as it may.
+
+    Attributes:
+        job: the job.
+        reason: how it failed last, one line.
+    """
+
+    def __init__(self, job: Job, reason: str) -> None:
+        super().__init__(f"job {job.shard_id} failed {MAX_ATTEMPTS} times; last: {reason}")
+        self.job = job
+        self.reason = reason
+
+
+class Fleet(Protocol):
+    """Executes jobs on some number of workers."""
+
+    workers: int
+    """How many work at the same time."""
+
+    def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
+        """Hand the weights of policy `version` to every worker, present and future."""
+        ...
+
+    def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[["Receipt"], None]) -> None:
+        """Execute `jobs`, in any order, and report each once.
+
+        Raises:
+            JobFailure: a job failed `MAX_ATTEMPTS` times for reasons of infrastructure.
+            AdaAffordError: a worker met a problem that the user must solve; it is not tried again.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the workers; whatever was not committed is lost, and nothing else is."""
+        ...
+
+
+class SerialFleet:
+    """One worker in this very process, without Ray: the same code for debugging, tests and tiny machines."""
+
+    workers = 1
+
+    def __init__(self, make_worker: WorkerFactory) -> None:
+        self._make_worker = make_worker
+        self._worker: Worker | None = None
+        self._policies: dict[int, Mapping[str, bytes]] = {}
+
+    def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
+        """See `Fleet.load_policy`."""
+        self._policies[version] = files
+        if self._worker is not None:
+            self._worker.load_policy(version, files)
+
+    def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[["Receipt"], None]) -> None:
+        """See `Fleet.run`."""
+        for job in jobs:
+            on_receipt(self._run_stubbornly(plan, job))
+
+    def close(self) -> None:
+        """See `Fleet.close`."""
+        self._worker = None
+
+    def _run_stubbornly(self, plan: Plan, job: Job) -> "Receipt":
+        """Try `job` with a fresh worker after each failure."""
+        reason = ""
+        for _ in range(MAX_ATTEMPTS):
+            try:
+                return self._live_worker().run(plan, job)
+            except AdaAffordError:
+                raise
+            except Exception as error:
+                logger.warning("job %s failed", job.shard_id, exc_info=True)
+                self._worker = None
+                reason = describe(error)
+        raise JobFailure(job, reason)
+
+    def _live_worker(self) -> Worker:
+        """The worker, made and given all policies if there is none yet."""
+        if self._worker is None:
+            self._worker = self._make_worker()
+            for version, files in self._policies.items():
+                self._worker.load_policy(version, files)
+        return self._worker
+
+
+def describe(error: BaseException) -> str:
+    """An exception in one line of bounded length."""
+    text = " ".join(str(error).split())[:300]
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

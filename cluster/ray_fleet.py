@@ -1,0 +1,159 @@
+"""The fleet of Ray actors: bounded work in flight, dead and hung actors replaced, only receipts coming back."""
+
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import ray
+from ray.exceptions import RayActorError, RayTaskError
+
+from cluster.fleet import MAX_ATTEMPTS, JobFailure, WorkerFactory, describe
+from collector.actor import WorkerActor
+from shared.errors import AdaAffordError
+from shared.plan import Job, Plan
+
+if TYPE_CHECKING:
+    from collector.worker import Receipt
+
+IN_FLIGHT = 2
+"""Jobs an actor holds: one under way, one that waits so that the actor never idles for the driver's sake."""
+POLL_S = 1.0
+"""How often the driver looks for hung actors when no receipt comes."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class _Seat:
+    """A place for one actor, and what it was given to do, oldest first."""
+
+    actor: Any = None
+    pending: deque[tuple[Any, Job]] = field(default_factory=deque)
+    busy_since: float = 0.0
+    """When the oldest pending job came to the head, `time.monotonic`."""
+
+
+class RayFleet:
+    """Actors of `collector.actor`, one CPU each, alive over all rounds. Needs a session (`cluster.session`)."""
+
+    def __init__(self, make_worker: WorkerFactory, workers: int, job_limit_s: float) -> None:
+        """Start nothing yet: actors come up with the first jobs.
+
+        Args:
+            make_worker: makes the worker within an actor.
+            workers: how many actors.
+            job_limit_s: an actor whose job takes longer is taken for hung. The engine holds the interpreter's lock
+                while it steps, so no watchdog within the actor could notice.
+        """
+        self.workers = workers
+        self._make_worker = make_worker
+        self._job_limit_s = job_limit_s
+        self._seats = [_Seat() for _ in range(workers)]
+        self._policies: dict[int, Any] = {}
+
+    def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
+        """See `Fleet.load_policy`: one `ray.put`; actors pull it when a plan first needs it."""
+        if version not in self._policies:
+            self._policies[version] = ray.put(dict(files))
+
+    def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[["Receipt"], None]) -> None:
+        """See `Fleet.run`."""
+        waiting = deque(jobs)
+        attempts: Counter[Job] = Counter()
+        try:
+            while waiting or any(seat.pending for seat in self._seats):
+                self._hand_out(plan, waiting)
+                refs = [ref for seat in self._seats for ref, _ in seat.pending]
+                ready, _ = ray.wait(refs, num_returns=1, timeout=min(POLL_S, self._job_limit_s / 4))
+                if ready:
+                    self._take_in(ready[0], waiting, attempts, on_receipt)
+                self._replace_hung(waiting, attempts)
+        finally:
+            # Only after a failure or an interrupt is anything left; what an actor would still commit is wanted by the
+            # next run anyway, but nobody would wait for it, so the actor goes.
+            for seat in self._seats:
+                if seat.pending:
+                    self._dismiss(seat)
+
+    def close(self) -> None:
+        """See `Fleet.close`."""
+        for seat in self._seats:
+            self._dismiss(seat)
+
+    def _hand_out(self, plan: Plan, waiting: deque[Job]) -> None:
+        """Give each actor up to `IN_FLIGHT` jobs; no actor gets a second one while another has none."""
+        policy = self._policies.get(plan.policy_version)
+        box = [] if policy is None else [policy]
+        for depth in range(IN_FLIGHT):
+            for seat in self._seats:
+                if not waiting:
+                    return
+                if len(seat.pending) == depth:
+                    if seat.actor is None:
+                        seat.actor = self._start()
+                    if not seat.pending:
+                        seat.busy_since = time.monotonic()
+                    job = waiting.popleft()
+                    seat.pending.append((seat.actor.run.remote(plan, job, box), job))
+
+    def _take_in(
+        self, ref: Any, waiting: deque[Job], attempts: Counter[Job], on_receipt: Callable[["Receipt"], None]
+    ) -> None:
+        """Report the receipt behind `ref`, or see to the failure that it stands for."""
+        seat = next(seat for seat in self._seats if any(ref == pending for pending, _ in seat.pending))
+        job = next(job for pending, job in seat.pending if pending == ref)
+        try:
+            receipt = ray.get(ref)
+        except RayActorError as error:
+            self._retry(seat, waiting, attempts, f"its process died ({describe(error)})")
+            return
+        except RayTaskError as error:
+            if isinstance(error.cause, AdaAffordError):
+                raise error.cause from None
+            self._settle(seat, ref)
+            self._count(job, attempts, describe(error.cause or error))
+            waiting.appendleft(job)
+            return
+        self._settle(seat, ref)
+        on_receipt(receipt)
+
+    def _replace_hung(self, waiting: deque[Job], attempts: Counter[Job]) -> None:
+        """Replace actors whose oldest job is over the limit."""
+        for seat in self._seats:
+            if seat.pending and time.monotonic() - seat.busy_since > self._job_limit_s:
+                self._retry(seat, waiting, attempts, f"it took more than {self._job_limit_s:g} s")
+
+    def _retry(self, seat: _Seat, waiting: deque[Job], attempts: Counter[Job], reason: str) -> None:
+        """Replace the seat's actor and put its jobs back in front; only the oldest one is to blame."""
+        jobs = [job for _, job in seat.pending]
+        self._dismiss(seat)
+        waiting.extendleft(reversed(jobs))
+        self._count(jobs[0], attempts, reason)
+
+    def _count(self, job: Job, attempts: Counter[Job], reason: str) -> None:
+        """Count a failure of `job` and give up after `MAX_ATTEMPTS`."""
+        logger.warning("job %s failed: %s", job.shard_id, reason)
+        attempts[job] += 1
+        if attempts[job] >= MAX_ATTEMPTS:
+            raise JobFailure(job, reason)
+
+    def _start(self) -> Any:
+        """A new actor. No restarts by Ray: those would run only `__init__` again, and lose what was in flight."""
+        return ray.remote(num_cpus=1, max_restarts=0)(WorkerActor).remote(self._make_worker)
+
+    @staticmethod
+    def _settle(seat: _Seat, ref: Any) -> None:
+        """Strike out one pending job; the next one comes to the head."""
+        seat.pending = deque(pair for pair in seat.pending if pair[0] != ref)
+        seat.busy_since = time.monotonic()
+
+    @staticmethod
+    def _dismiss(seat: _Seat) -> None:
+        """End the seat's actor and forget what it was given."""
+        if seat.actor is not None:
+            ray.kill(seat.actor)
+        seat.actor = None
+        seat.pending.clear()

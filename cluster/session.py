@@ -1,0 +1,118 @@
+"""The Ray session: a private one on this machine's loopback, or a connection to a cluster that runs already."""
+
+import logging
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from cluster.fleet import Fleet, SerialFleet, WorkerFactory
+from shared.errors import UsageError
+
+OBJECT_STORE_BYTES = 128 << 20
+"""Only weights and receipts travel, so the smallest object store that Ray likes is ample."""
+
+_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # The new behaviour; unset, Ray warns that it will come.
+    "RAY_DISABLE_IMPORT_WARNING": "1",
+    # Actors inherit these: one CPU each, and no library may think that it has more.
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+
+FleetMaker = Callable[[WorkerFactory], Fleet]
+
+logger = logging.getLogger(__name__)
+
+
+@contextmanager
+def fleets(workers: int, job_limit_s: float, address: str | None = None) -> Iterator[FleetMaker]:
+    """A maker of fleets that live at most as long as the context: serial if `workers` is 0, else on Ray.
+
+    Args:
+        workers: how many actors a fleet has; 0 does without Ray.
+        job_limit_s: see `cluster.ray_fleet.RayFleet`.
+        address: of a running Ray cluster; None starts a session of our own on this machine.
+    """
+    with ExitStack() as stack:
+        if workers > 0:
+            stack.enter_context(ray_session(workers, address))
+
+        def make(make_worker: WorkerFactory) -> Fleet:
+            if workers == 0:
+                return SerialFleet(make_worker)
+            from cluster.ray_fleet import RayFleet
+
+            fleet = RayFleet(make_worker, workers, job_limit_s)
+            stack.callback(fleet.close)
+            return fleet
+
+        yield make
+
+
+@contextmanager
+def ray_session(workers: int, address: str | None = None) -> Iterator[None]:
+    """Hold a Ray session: no dashboard, quiet, and shut down in the end whatever happens.
+
+    Raises:
+        UsageError: there is no cluster at `address`.
+    """
+    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    os.environ.update(_ENVIRONMENT)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Ray's own deprecations; a user can do nothing about them.
+        import ray
+
+        _quieten()
+        try:
+            if address is None:
+                _start_on_loopback(workers)
+            else:
+                ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
+        except ConnectionError:
+            raise UsageError(f"no Ray cluster answers at '{address}'; start one, or leave the address out") from None
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _start_on_loopback(workers: int) -> None:
+    """Start Ray so that nothing listens beyond this machine: it executes code for whoever reaches its ports.
+
+    Ray replaces 127.0.0.1 by the address that others would reach, except where it believes that clusters are not
+    supported (as on macOS and Windows); so that belief is installed while the session starts.
+    """
+    import ray
+    from ray._private import ray_constants
+
+    clusters = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        ray.init(
+            num_cpus=workers,
+            num_gpus=0,
+            include_dashboard=False,
+            object_store_memory=OBJECT_STORE_BYTES,
+            logging_level=logging.ERROR,
+            log_to_driver=False,
+            _node_ip_address="127.0.0.1",
+        )
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = clusters
+
+
+def _quieten() -> None:
+    """Send what raylets would print on our terminal (such as the end of an actor that we report ourselves) to the log."""
+    from ray._private import worker
+
+    def to_log(data: dict[str, Any], ignore_prefix: bool = False) -> None:
+        logger.debug("%s", " ".join(data.get("lines", ())))
+
+    worker.print_to_stdstream = to_log

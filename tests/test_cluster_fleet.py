@@ -1,0 +1,150 @@
+"""One conformance suite for both fleets, and what only the fleet of processes must bear."""
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from cluster.fleet import Fleet, JobFailure, WorkerFactory
+from cluster.session import fleets
+from collector.worker import Receipt
+from shared.configuration import CollectionConfig
+from shared.errors import StoreError
+from shared.plan import Job, ObjectRef, Plan, Setting, missing_jobs
+from tests.fake_worker import FakeWorker
+
+MakeFleet = Callable[[WorkerFactory], Fleet]
+JOB_LIMIT_S = 4.0
+
+
+@pytest.fixture(scope="module")
+def ray_fleets() -> Iterator[MakeFleet]:
+    with fleets(workers=2, job_limit_s=JOB_LIMIT_S) as make:
+        yield make
+
+
+@pytest.fixture(params=["serial", "ray"])
+def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
+    factory = partial(FakeWorker, tmp_path)
+    if request.param == "ray":
+        fleet = request.getfixturevalue("ray_fleets")(factory)
+        yield fleet
+        fleet.close()
+    else:
+        with fleets(workers=0, job_limit_s=JOB_LIMIT_S) as make:
+            yield make(factory)
+
+
+@pytest.fixture
+def ray_fleet(ray_fleets: MakeFleet, tmp_path: Path) -> Iterator[Fleet]:
+    fleet = ray_fleets(partial(FakeWorker, tmp_path))
+    yield fleet
+    fleet.close()
+
+
+def plan(proposer: str = "random", version: int = 0) -> Plan:
+    ref = ObjectRef(id="1", category="Box", content_hash="0" * 64)
+    setting = Setting(task="push", seed=1, objects=(ref,), collection=CollectionConfig())
+    return Plan(setting=setting, proposer=proposer, policy_version=version)
+
+
+def jobs(count: int, key: str = "random-v0") -> list[Job]:
+    return missing_jobs(key, count, [], 1)
+
+
+def run(fleet: Fleet, count: int) -> list[str]:
+    receipts: list[Receipt] = []
+    fleet.run(plan(), jobs(count), receipts.append)
+    return sorted(receipt.shard_id for receipt in receipts)
+
+
+def begun(folder: Path, job: Job) -> int:
+    return sum(line.split()[0] == job.shard_id for line in (folder / "begun").read_text().splitlines())
+
+
+def test_every_job_is_reported_exactly_once(fleet: Fleet, tmp_path: Path) -> None:
+    assert run(fleet, 7) == [job.shard_id for job in jobs(7)]
+    assert len(list(tmp_path.glob("shard-*"))) == 7
+
+
+def test_nothing_to_do_is_no_error(fleet: Fleet) -> None:
+    assert run(fleet, 0) == []
+
+
+def test_a_failure_of_infrastructure_is_tried_again(fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "raise-2").write_text("2")
+    assert run(fleet, 4) == [job.shard_id for job in jobs(4)]
+    assert begun(tmp_path, jobs(4)[2]) == 3
+
+
+def test_a_job_that_always_fails_ends_the_run_after_three_attempts(fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "raise-1").write_text("99")
+    with pytest.raises(JobFailure, match=r"^job random-v0-00000001-00000002 failed 3 times; last: RuntimeError: .*$"):
+        run(fleet, 3)
+    assert begun(tmp_path, jobs(3)[1]) == 3
+
+
+def test_what_the_user_must_solve_is_not_tried_again(fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "refuse-0").write_text("99")
+    with pytest.raises(StoreError, match=r"^the store is damaged$"):
+        run(fleet, 1)
+    assert begun(tmp_path, jobs(1)[0]) == 1
+
+
+def test_a_fleet_goes_on_after_a_failed_run(fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "refuse-0").write_text("1")
+    with pytest.raises(StoreError):
+        run(fleet, 3)
+    assert run(fleet, 3) == [job.shard_id for job in jobs(3)]
+
+
+def test_weights_reach_the_live_workers_once_a_version(fleet: Fleet, tmp_path: Path) -> None:
+    run(fleet, 4)
+    before = {line.split()[1] for line in (tmp_path / "begun").read_text().splitlines()}
+    for version in (1, 2):
+        fleet.load_policy(version, {"weights.safetensors": b"weights %d" % version})
+        fleet.run(plan("aip", version), jobs(8, f"aip-v{version}"), lambda receipt: None)
+        pulls = (tmp_path / f"pulled-{version}").read_text().split()
+        assert len(pulls) == len(set(pulls)) <= fleet.workers
+    assert {line.split()[1] for line in (tmp_path / "begun").read_text().splitlines()} == before
+
+
+def test_a_dead_actor_is_replaced_and_its_jobs_are_done(ray_fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "die-1").write_text("2")
+    assert run(ray_fleet, 6) == [job.shard_id for job in jobs(6)]
+
+
+def test_a_replaced_actor_pulls_the_weights_itself(ray_fleet: Fleet, tmp_path: Path) -> None:
+    ray_fleet.load_policy(1, {"weights.safetensors": b"weights 1"})
+    (tmp_path / "die-2").write_text("1")
+    done: list[Receipt] = []
+    ray_fleet.run(plan("aip", 1), jobs(6, "aip-v1"), done.append)
+    assert len(done) == 6
+
+
+def test_a_hung_actor_is_replaced(ray_fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "hang-0").write_text("1")
+    assert run(ray_fleet, 4) == [job.shard_id for job in jobs(4)]
+    assert begun(tmp_path, jobs(4)[0]) == 2
+
+
+def test_an_actor_holds_at_most_two_jobs(ray_fleet: Fleet, tmp_path: Path) -> None:
+    most = 0
+
+    def watch(receipt: Receipt) -> None:
+        nonlocal most
+        seats = ray_fleet._seats  # type: ignore[attr-defined]
+        most = max(most, *(len(seat.pending) for seat in seats))
+
+    ray_fleet.run(plan(), jobs(12), watch)
+    assert most <= 2
+
+
+def test_an_interrupt_leaves_no_actor_at_work(ray_fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "hang-1").write_text("9")
+    with pytest.raises(KeyboardInterrupt):
+        ray_fleet.run(plan(), jobs(4), lambda receipt: os.kill(os.getpid(), signal.SIGINT))
+    assert not any(seat.pending for seat in ray_fleet._seats)  # type: ignore[attr-defined]
