@@ -1,0 +1,215 @@
+"""The columns of the two tables: one list that the writer, the reader, the digest and the schema all follow."""
+
+import operator
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from shared.records import InteractionRecord, RolloutRecord
+from shared.vocabulary import Float
+
+Row = TypeVar("Row")
+
+LIST = -1
+"""Width of a cell that holds any number of numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutRow:
+    """What a row of rollouts.parquet is computed from."""
+
+    rollout: RolloutRecord
+    first_observation: int
+    """Index within the shard of the rollout's first observation."""
+
+
+@dataclass(frozen=True, slots=True)
+class InteractionRow:
+    """What a row of interactions.parquet is computed from."""
+
+    rollout: RolloutRecord
+    interaction: InteractionRecord
+    first_observation: int
+
+    def in_camera(self, vectors: Float, *, place: bool) -> Float:
+        """Columns [3] or [3, k] of the world in the camera's frame; a place is moved, a direction only turned."""
+        pose = self.rollout.observations[self.interaction.observation].world_from_camera
+        turned: Float = pose[:3, :3].T @ (vectors - pose[:3, 3] if place else vectors)
+        return turned
+
+
+@dataclass(frozen=True, slots=True)
+class Column(Generic[Row]):
+    """One column.
+
+    Attributes:
+        name: of the column.
+        dtype: little-endian numpy type of a cell's numbers; "" for text.
+        width: 0 for a scalar, n for a vector, LIST for any number of numbers.
+        description: for the schema.
+        value: the cell of a row.
+        content: whether it enters the content digest; what depends on the shard, on time or on other columns does not.
+    """
+
+    name: str
+    dtype: str
+    width: int
+    description: str
+    value: Callable[[Row], Any]
+    content: bool = True
+
+    @property
+    def arrow_type(self) -> Any:
+        """The pyarrow type."""
+        if not self.dtype:
+            return pa.string()
+        number = pa.from_numpy_dtype(np.dtype(self.dtype))
+        return pa.list_(pa.field("element", number, nullable=False), self.width) if self.width else number
+
+    @property
+    def field(self) -> Any:
+        """The pyarrow field, with the description in its metadata."""
+        return pa.field(self.name, self.arrow_type, nullable=False, metadata={"description": self.description})
+
+    def gather(self, rows: Sequence[Row]) -> "Cells":
+        """The column's cells for some rows.
+
+        Raises:
+            ValueError: a cell has another shape than the column.
+            TypeError: a cell is of another type.
+            OverflowError: an integer does not fit.
+        """
+        values = [self.value(row) for row in rows]
+        if not self.dtype:
+            return Cells(np.empty(0), tuple(str(value) for value in values), ())
+        if self.width == LIST:
+            parts = [np.asarray(value, self.dtype) for value in values]
+            if any(part.ndim != 1 for part in parts):
+                raise ValueError(f"{self.name} must be a list of numbers")
+            return Cells(np.concatenate([np.empty(0, self.dtype), *parts]), (), tuple(len(part) for part in parts))
+        if self.dtype[1] in "iu":
+            values = [operator.index(value) for value in values]
+        numbers = np.array(values, self.dtype)
+        shape = (len(rows), self.width) if self.width else (len(rows),)
+        if numbers.size and numbers.shape != shape:
+            raise ValueError(f"{self.name} has shape {numbers.shape[1:]}, needs {shape[1:]}")
+        return Cells(numbers.ravel(), (), ())
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """The cells of a column, side by side."""
+
+    numbers: NDArray[Any]
+    texts: tuple[str, ...]
+    lengths: tuple[int, ...]
+    """Of each cell of a LIST column."""
+
+
+def _rollout_columns() -> tuple[Column[RolloutRow], ...]:
+    r = operator.attrgetter("rollout")
+    return (
+        Column("plan_key", "", 0, "plan", lambda x: r(x).plan_key),
+        Column("rollout", "<i8", 0, "number within the plan", lambda x: r(x).index),
+        Column("object_id", "", 0, "object", lambda x: r(x).object.id),
+        Column("object_category", "", 0, "its category", lambda x: r(x).object.category),
+        Column("object_hash", "", 0, "SHA-256 of its files", lambda x: r(x).object.content_hash),
+        Column("part_mass", "<f8", 0, "hidden: mass of a movable part, kg", lambda x: r(x).dynamics.part_mass),
+        Column("joint_friction", "<f8", 0, "hidden: N m or N", lambda x: r(x).dynamics.joint_friction),
+        Column("surface_friction", "<f8", 0, "hidden: coefficient", lambda x: r(x).dynamics.surface_friction),
+        Column("direction", "", 0, "hidden: ways the joint turns", lambda x: r(x).dynamics.direction),
+        Column("azimuth_deg", "<f8", 0, "camera", lambda x: r(x).azimuth_deg),
+        Column("elevation_deg", "<f8", 0, "camera", lambda x: r(x).elevation_deg),
+        Column("seed", "<u8", 0, "the plan's seed", lambda x: r(x).seed),
+        Column("fidelity", "", 0, "name of the preset", lambda x: r(x).fidelity),
+        Column("status", "", 0, "ok, or why there are no interactions", lambda x: r(x).status),
+        Column("observations", "<i8", 0, "how many", lambda x: len(r(x).observations)),
+        Column("interactions", "<i8", 0, "how many", lambda x: len(r(x).interactions)),
+        Column("first_observation", "<i8", 0, "index in the shard", lambda x: x.first_observation, content=False),
+    )
+
+
+def _interaction_columns() -> tuple[Column[InteractionRow], ...]:
+    i = operator.attrgetter("interaction")
+    a = operator.attrgetter("interaction.action")
+    o = operator.attrgetter("interaction.outcome")
+    shared: tuple[str, ...] = (
+        "plan_key",
+        "rollout",
+        "object_id",
+        "object_category",
+        "object_hash",
+        "part_mass",
+        "joint_friction",
+    )
+    shared += ("surface_friction", "direction", "azimuth_deg", "elevation_deg", "seed", "fidelity")
+    return (
+        *(_of_rollout(column) for column in ROLLOUT_COLUMNS if column.name in shared),
+        Column("step", "<i4", 0, "number within the rollout", lambda x: i(x).step),
+        Column("rollout_observation", "<i4", 0, "index within the rollout", lambda x: i(x).observation),
+        Column(
+            "observation",
+            "<i4",
+            0,
+            "index in the shard",
+            lambda x: x.first_observation + i(x).observation,
+            content=False,
+        ),
+        Column("point_index", "<i4", 0, "of p in the cloud", lambda x: a(x).point_index),
+        Column("point", "<f8", 3, "p, world", lambda x: a(x).point),
+        Column("rotation", "<f8", 9, "R, world, row by row", lambda x: a(x).rotation.ravel()),
+        Column("point_camera", "<f8", 3, "p, camera", lambda x: x.in_camera(a(x).point, place=True), content=False),
+        Column(
+            "rotation_camera",
+            "<f8",
+            9,
+            "R, camera, row by row",
+            lambda x: x.in_camera(a(x).rotation, place=False).ravel(),
+            content=False,
+        ),
+        Column("normal", "<f8", 3, "surface normal at p, world", lambda x: i(x).normal),
+        Column("primitive", "", 0, "gripper primitive", lambda x: i(x).primitive),
+        Column("order", "", 0, "restart or continue", lambda x: i(x).order),
+        Column("role", "", 0, "what the row is for", lambda x: i(x).role),
+        Column("proposer", "", 0, "who chose the action", lambda x: i(x).proposer),
+        Column("policy_version", "<i4", 0, "policy it used; 0: none", lambda x: i(x).policy_version),
+        Column("method", "", 0, "evaluation: whose try", lambda x: i(x).method),
+        Column("budget", "<i4", 0, "evaluation: tries before; -1: none", lambda x: i(x).budget),
+        Column("target_part", "<i4", 0, "1-based movable part under p", lambda x: i(x).target_part),
+        Column("target_link", "", 0, "its link", lambda x: i(x).target_link),
+        Column("target_joint", "", 0, "its joint", lambda x: i(x).target_joint),
+        Column("joint_positions", "<f8", LIST, "all joints at the start", lambda x: i(x).joint_positions),
+        Column("joint_limits", "<f8", LIST, "lower, upper of each joint", lambda x: i(x).joint_limits.ravel()),
+        Column("hand_start", "<f8", 7, "hand at the start, world, xyz wxyz", lambda x: i(x).hand_start),
+        Column("outcome", "", 0, "how the trial ended", lambda x: o(x).kind),
+        Column("motion", "<f8", 0, "m, rad or length", lambda x: o(x).motion),
+        Column("success", "|b1", 0, "r", lambda x: o(x).success),
+        Column("start_joint_position", "<f8", 0, "of the target", lambda x: o(x).start_joint_position),
+        Column("end_joint_position", "<f8", 0, "of the target", lambda x: o(x).end_joint_position),
+        Column("displacement", "<f8", 3, "of the touched point, world", lambda x: o(x).displacement),
+        Column("grasp_opening", "<f8", 0, "both fingers after closing", lambda x: o(x).grasp_opening),
+        Column("steps", "<i8", 0, "physics steps", lambda x: o(x).steps),
+        Column("seconds", "<f8", 0, "wall time", lambda x: i(x).seconds, content=False),
+    )
+
+
+def _of_rollout(column: Column[RolloutRow]) -> Column[InteractionRow]:
+    """The same column in interactions.parquet, for rows that are read alone; a copy, so not content."""
+    return Column(
+        column.name,
+        column.dtype,
+        column.width,
+        column.description,
+        lambda row: column.value(RolloutRow(row.rollout, row.first_observation)),
+        content=False,
+    )
+
+
+ROLLOUT_COLUMNS = _rollout_columns()
+INTERACTION_COLUMNS = _interaction_columns()
+COPIED_COLUMNS = tuple(c.name for c in INTERACTION_COLUMNS if c.name in {r.name for r in ROLLOUT_COLUMNS})
+"""Columns of interactions.parquet that repeat the row's rollout."""

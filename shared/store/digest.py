@@ -1,0 +1,50 @@
+"""The content digest: over the data without times, hosts, versions or shards.
+
+Same plan, same seed, same policy: same digest, whether one worker made the rollouts or a thousand.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from shared.records import RolloutRecord
+from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, Column, InteractionRow, RolloutRow
+from shared.store.observations import ARRAYS
+
+Row = TypeVar("Row")
+
+
+def rollout_digest(rollout: RolloutRecord) -> str:
+    """SHA-256 of one rollout, over the canonical little-endian bytes of its columns and clouds."""
+    digest = hashlib.sha256()
+    _add_columns(digest, ROLLOUT_COLUMNS, [RolloutRow(rollout, 0)])
+    rows = [InteractionRow(rollout, interaction, 0) for interaction in rollout.interactions]
+    _add_columns(digest, INTERACTION_COLUMNS, rows)
+    for observation in rollout.observations:
+        for array in ARRAYS:
+            packed = array.pack(getattr(observation, array.name))
+            _add(digest, array.name, packed.shape, packed.tobytes())
+    return digest.hexdigest()
+
+
+def combined_digest(digests: Iterable[tuple[str, int, str]]) -> str:
+    """SHA-256 of many rollouts, given as plan key, number within the plan and digest, in any order."""
+    lines = (f"{plan_key} {index} {digest}\n" for plan_key, index, digest in sorted(digests))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _add_columns(digest: Any, columns: Sequence[Column[Row]], rows: Sequence[Row]) -> None:
+    for column in columns:
+        if column.content:
+            cells = column.gather(rows)
+            # Lengths and texts are framed as JSON, so that no two columns of cells give the same bytes.
+            frame = (len(rows), cells.lengths, cells.texts)
+            _add(digest, column.name, frame, np.ascontiguousarray(cells.numbers).tobytes())
+
+
+def _add(digest: Any, name: str, frame: Sequence[Any], data: bytes) -> None:
+    digest.update(json.dumps([name, frame, len(data)], separators=(",", ":")).encode())
+    digest.update(data)

@@ -1,0 +1,75 @@
+"""What a store holds, in figures."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from shared.store.store import Store
+from shared.vocabulary import OutcomeKind
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """How many interactions, and how many of them succeeded; infrastructure failures are in neither."""
+
+    interactions: int
+    successes: int
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the interactions that succeeded; NaN for none."""
+        return self.successes / self.interactions if self.interactions else float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class StoreInfo:
+    """What a store holds. Dictionaries are in order of name."""
+
+    shards: int
+    rollouts: int
+    interactions: int
+    observations: int
+    bytes: int
+    by_category: dict[str, Tally]
+    by_proposer: dict[str, Tally]
+    """By proposer and policy version, such as "aip v1"."""
+    by_role: dict[str, Tally]
+    by_outcome: dict[str, int]
+    by_status: dict[str, int]
+    """Rollouts by status."""
+
+    @property
+    def bytes_per_interaction(self) -> float:
+        """All files of all shards over all interactions; NaN for none."""
+        return self.bytes / self.interactions if self.interactions else float("nan")
+
+
+def info(store: Store) -> StoreInfo:
+    """Count what a store holds.
+
+    Raises:
+        StoreError: a file is damaged or foreign.
+    """
+    manifests = store.committed()
+    columns = ["object_category", "proposer", "policy_version", "role", "outcome", "success"]
+    table = store.interactions(columns).to_pydict()
+    labels = [OutcomeKind(kind).is_label for kind in table["outcome"]]
+    proposers = [f"{n} v{v}" for n, v in zip(table["proposer"], table["policy_version"], strict=True)]
+
+    def tally(names: Sequence[str]) -> dict[str, Tally]:
+        rows = [(name, ok) for name, ok, label in zip(names, table["success"], labels, strict=True) if label]
+        tried, succeeded = Counter(name for name, _ in rows), Counter(name for name, ok in rows if ok)
+        return {name: Tally(count, succeeded[name]) for name, count in sorted(tried.items())}
+
+    return StoreInfo(
+        shards=len(manifests),
+        rollouts=sum(manifest.rollouts for manifest in manifests),
+        interactions=len(labels),
+        observations=sum(manifest.observations for manifest in manifests),
+        bytes=sum(manifest.bytes for manifest in manifests),
+        by_category=tally(table["object_category"]),
+        by_proposer=tally(proposers),
+        by_role=tally(table["role"]),
+        by_outcome=dict(sorted(Counter(table["outcome"]).items())),
+        by_status=dict(sorted(Counter(store.rollouts().column("status").to_pylist()).items())),
+    )

@@ -1,0 +1,160 @@
+"""What lies where in a store, and the documents that describe it.
+
+    STORE/
+      store.json                     schema version, setting, software; written once
+      plans/<plan key>.json          who proposes
+      shards/<shard id>/             complete if, and only if, manifest.json is there
+        interactions.parquet         one row an interaction
+        rollouts.parquet             one row a rollout
+        observations.zarr/           the clouds
+        manifest.json                counts, checksums, content digests, provenance; written last
+      policies/<version>/            whatever the learner publishes, and index.json
+
+Names that begin with ".tmp-" are work in progress or its remnants; names that begin with ".lock-" are locks.
+"""
+
+import re
+from typing import Any
+
+from pydantic import Field, ValidationError, model_validator
+
+from shared.configuration import StrictModel
+from shared.errors import StoreError
+from shared.plan import Job, Setting
+from shared.store.sealed import parse_object, unseal
+
+SCHEMA_VERSION = 1
+STORE_FILE = "store.json"
+MANIFEST_FILE = "manifest.json"
+INTERACTIONS_FILE = "interactions.parquet"
+ROLLOUTS_FILE = "rollouts.parquet"
+OBSERVATIONS_FOLDER = "observations.zarr"
+PLANS_FOLDER = "plans"
+SHARDS_FOLDER = "shards"
+POLICIES_FOLDER = "policies"
+LOCK_PREFIX = ".lock-"
+
+MAX_DOCUMENT_BYTES = 64 << 20
+"""No document of a store is larger; a million objects in a setting would be."""
+MAX_ROLLOUTS = 1 << 16
+MAX_INTERACTIONS = 1 << 20
+MAX_OBSERVATIONS = 1 << 16
+MAX_POINTS = 1 << 14
+"""Bounds of one shard, so that a hostile manifest cannot ask for unbounded work."""
+
+_SHA256 = r"^[0-9a-f]{64}$"
+PLAN_KEY = r"[a-z][a-z0-9-]{0,30}-v[0-9]{1,9}"
+_SHARD_ID = re.compile(rf"^(?P<plan>{PLAN_KEY})-(?P<start>\d{{8,12}})-(?P<stop>\d{{8,12}})$")
+
+
+class FileEntry(StrictModel):
+    """What a file of a shard must be."""
+
+    size: int = Field(ge=0)
+    sha256: str = Field(pattern=_SHA256)
+
+
+class ShardManifest(StrictModel):
+    """What a shard holds. Its presence commits the shard."""
+
+    schema_version: int = SCHEMA_VERSION
+    plan_key: str = Field(pattern=rf"^{PLAN_KEY}$")
+    start: int = Field(ge=0)
+    stop: int = Field(ge=1)
+    interactions: int = Field(ge=0, le=MAX_INTERACTIONS)
+    observations: int = Field(ge=0, le=MAX_OBSERVATIONS)
+    points: int = Field(ge=1, le=MAX_POINTS)
+    """N, of every cloud."""
+    files: dict[str, FileEntry]
+    """By path within the shard; all but the manifest itself."""
+    digests: tuple[str, ...] = Field(max_length=MAX_ROLLOUTS)
+    """Content digest of each rollout, from `start` on."""
+    software: dict[str, str]
+    provenance: dict[str, str]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "ShardManifest":
+        if self.stop - self.start != len(self.digests) or not self.digests:
+            raise ValueError(f"rollouts {self.start} to {self.stop} need as many digests, not {len(self.digests)}")
+        if not all(re.match(_SHA256, digest) for digest in self.digests):
+            raise ValueError("a digest is not a SHA-256")
+        return self
+
+    @property
+    def shard_id(self) -> str:
+        """Name of the shard's folder."""
+        return Job(self.plan_key, self.start, self.stop).shard_id
+
+    @property
+    def rollouts(self) -> int:
+        """How many rollouts it holds, those without interactions included."""
+        return self.stop - self.start
+
+    @property
+    def bytes(self) -> int:
+        """Size of the shard on disk, the manifest left out."""
+        return sum(entry.size for entry in self.files.values())
+
+
+class StoreDocument(StrictModel):
+    """What store.json says."""
+
+    schema_version: int = SCHEMA_VERSION
+    setting: Setting
+    software: dict[str, str]
+    created: str
+    """UTC, ISO 8601."""
+
+
+def parse_manifest(data: bytes, source: str) -> ShardManifest:
+    """A manifest from hostile bytes.
+
+    Raises:
+        StoreError: damaged, foreign, or of another schema version.
+    """
+    check_schema_version(parse_object(data, source), source)
+    try:
+        return ShardManifest.model_validate(unseal(data, source))
+    except ValidationError as error:
+        raise StoreError(f"{source}: not a manifest ({_first(error)})") from None
+
+
+def parse_store_document(data: bytes, source: str) -> StoreDocument:
+    """store.json from hostile bytes.
+
+    Raises:
+        StoreError: damaged, foreign, or of another schema version.
+    """
+    check_schema_version(parse_object(data, source), source)
+    try:
+        return StoreDocument.model_validate(unseal(data, source))
+    except ValidationError as error:
+        raise StoreError(f"{source}: not a store's description ({_first(error)})") from None
+
+
+def check_schema_version(content: dict[str, Any], source: str) -> None:
+    """Refuse documents of other schema versions.
+
+    Raises:
+        StoreError: the version is another, or missing.
+    """
+    version = content.get("schema_version")
+    if version != SCHEMA_VERSION:
+        raise StoreError(
+            f"{source}: schema version {str(version)[:20]}, but this software reads version {SCHEMA_VERSION}; "
+            "use the software that wrote it"
+        )
+
+
+def parse_shard_id(name: str) -> Job | None:
+    """The job whose shard would be called `name`; None if no shard is called that."""
+    match = _SHARD_ID.match(name)
+    if match is None:
+        return None
+    job = Job(match["plan"], int(match["start"]), int(match["stop"]))
+    return job if job.start < job.stop and job.shard_id == name else None
+
+
+def _first(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    return f"{'.'.join(str(part) for part in problem['loc']) or 'content'}: {problem['msg']}"[:160]

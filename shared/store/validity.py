@@ -1,0 +1,102 @@
+"""What a rollout must satisfy to be stored, and what is read must satisfy to be believed."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from shared.errors import StoreError
+from shared.plan import Job
+from shared.records import InteractionRecord, RolloutRecord
+from shared.store.observations import check_observation
+from shared.vocabulary import Float
+
+MAX_TEXT = 200
+MAX_PARTS = 255
+"""Movable parts that an object may have: part ids are bytes."""
+
+
+def check_rollouts(rollouts: Sequence[RolloutRecord], job: Job, points: int, source: str) -> None:
+    """Hold the rollouts of a shard to the job that they came from and to the rules of a record.
+
+    Args:
+        rollouts: in order.
+        job: the range of rollouts that they must be.
+        points: N, that every cloud must have.
+        source: what messages call them.
+
+    Raises:
+        StoreError: with the rollout, the step and what is wrong.
+    """
+    if [rollout.index for rollout in rollouts] != list(range(job.start, job.stop)):
+        raise StoreError(f"{source}: needs rollouts {job.start} to {job.stop - 1}, each once and in order")
+    for rollout in rollouts:
+        try:
+            if rollout.plan_key != job.plan_key:
+                raise ValueError(f"belongs to plan '{rollout.plan_key}', not '{job.plan_key}'")
+            _check_rollout(rollout, points)
+        except (ValueError, TypeError, AttributeError) as error:
+            raise StoreError(f"{source}: rollout {rollout.index}: {error}") from None
+
+
+def _check_rollout(rollout: RolloutRecord, points: int) -> None:
+    _check_texts(rollout.fidelity, rollout.status, rollout.object.category)
+    _check_finite("rollout's numbers", _rollout_numbers(rollout))
+    for observation in rollout.observations:
+        check_observation(observation, points)
+    steps = [interaction.step for interaction in rollout.interactions]
+    if sorted(set(steps)) != steps or (steps and steps[0] < 0):
+        raise ValueError(f"steps must grow, given {str(steps)[:80]}")
+    for interaction in rollout.interactions:
+        try:
+            _check_interaction(interaction, rollout)
+        except (ValueError, TypeError, AttributeError) as error:
+            raise ValueError(f"step {interaction.step}: {error}") from None
+
+
+def _rollout_numbers(rollout: RolloutRecord) -> list[float]:
+    dynamics = rollout.dynamics
+    hidden = [dynamics.part_mass, dynamics.joint_friction, dynamics.surface_friction]
+    return [*hidden, rollout.azimuth_deg, rollout.elevation_deg]
+
+
+def _check_interaction(interaction: InteractionRecord, rollout: RolloutRecord) -> None:
+    action, outcome = interaction.action, interaction.outcome
+    if not 0 <= interaction.observation < len(rollout.observations):
+        raise ValueError(f"refers to observation {interaction.observation} of {len(rollout.observations)}")
+    cloud = rollout.observations[interaction.observation].points
+    if not 0 <= action.point_index < len(cloud):
+        raise ValueError(f"refers to point {action.point_index} of {len(cloud)}")
+    parts = len(interaction.joint_positions)
+    if not 1 <= interaction.target_part <= parts <= MAX_PARTS:
+        raise ValueError(f"target part {interaction.target_part} of {parts}; allowed: 1 to {min(parts, MAX_PARTS)}")
+    _check_array("point", action.point, (3,))
+    _check_array("rotation", action.rotation, (3, 3))
+    _check_array("normal", interaction.normal, (3,))
+    _check_array("joint positions", interaction.joint_positions, (parts,))
+    _check_array("joint limits", interaction.joint_limits, (parts, 2))
+    _check_array("hand start", interaction.hand_start, (7,))
+    _check_array("displacement", outcome.displacement, (3,), nan=True)
+    _check_finite("motion or seconds", [outcome.motion, interaction.seconds])
+    if outcome.motion < 0:
+        raise ValueError(f"motion is {outcome.motion}; it is never negative")
+    texts = (interaction.proposer, interaction.method, interaction.target_link, interaction.target_joint)
+    _check_texts(*texts)
+
+
+def _check_array(name: str, array: Float, shape: tuple[int, ...], *, nan: bool = False) -> None:
+    if array.dtype != np.float64 or array.shape != shape:
+        raise ValueError(f"{name} is {array.dtype} {array.shape}, needs float64 {shape}")
+    if not nan and not np.isfinite(array).all():
+        raise ValueError(f"{name} holds a number that is not finite")
+
+
+def _check_finite(name: str, numbers: Sequence[float]) -> None:
+    if not all(math.isfinite(number) for number in numbers):
+        raise ValueError(f"{name} not finite: {numbers}")
+
+
+def _check_texts(*texts: str) -> None:
+    for text in texts:
+        if len(text) > MAX_TEXT or not text.isprintable():
+            raise ValueError(f"text of {len(text)} characters, {text[:40]!r}; allowed: {MAX_TEXT} printable ones")

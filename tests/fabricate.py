@@ -1,0 +1,145 @@
+"""Valid records out of thin air, for tests that need data and no simulator.
+
+setting = fabricate_setting(objects=3, points=64)
+plan = Plan(setting=setting)
+rollout = fabricate_rollout(plan, index=5, interactions=32)
+"""
+
+import hashlib
+
+import numpy as np
+
+from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
+from shared.geometry import camera_pose, gripper_rotation
+from shared.observation import round_normals, round_points
+from shared.plan import Job, ObjectRef, Plan, Setting
+from shared.records import InteractionRecord, RolloutRecord
+from shared.vocabulary import (
+    Action,
+    Direction,
+    HiddenDynamics,
+    Observation,
+    Order,
+    Outcome,
+    OutcomeKind,
+    Primitive,
+    Role,
+)
+
+
+def fabricate_setting(objects: int = 3, points: int = 64, seed: int = 7) -> Setting:
+    """A setting of `objects` objects of two categories."""
+    refs = tuple(
+        ObjectRef(
+            id=f"object-{k}",
+            category=("StorageFurniture", "Faucet")[k % 2],
+            content_hash=hashlib.sha256(str(k).encode()).hexdigest(),
+        )
+        for k in range(objects)
+    )
+    collection = CollectionConfig(camera=CameraConfig(points=points), rollout=RolloutConfig(interactions=32))
+    return Setting(task="push", seed=seed, objects=refs, collection=collection)
+
+
+def fabricate_rollout(plan: Plan, index: int, interactions: int = 8, per_observation: int = 8) -> RolloutRecord:
+    """A rollout that depends on the plan and the index alone; none of the physics is meant to make sense."""
+    setting = plan.setting
+    rng = np.random.default_rng([setting.seed, index, *plan.key.encode()])
+    azimuth, elevation = rng.uniform(135, 225), rng.uniform(30, 60)
+    parts = int(rng.integers(1, 5))
+    pose = camera_pose(azimuth, elevation, 5.0)
+    clouds = -(-interactions // per_observation)
+    observations = tuple(
+        fabricate_observation(rng, setting.collection.camera.points, pose, parts) for _ in range(clouds)
+    )
+    return RolloutRecord(
+        index=index,
+        plan_key=plan.key,
+        object=setting.objects[index % len(setting.objects)],
+        dynamics=HiddenDynamics(
+            part_mass=rng.uniform(0.05, 0.5),
+            joint_friction=rng.uniform(0.0, 2.0),
+            surface_friction=rng.uniform(0.1, 4.0),
+            direction=list(Direction)[int(rng.integers(len(Direction)))],
+        ),
+        azimuth_deg=azimuth,
+        elevation_deg=elevation,
+        seed=setting.seed,
+        fidelity=setting.collection.fidelity.name,
+        status="ok" if interactions else "no-visible-part",
+        observations=observations,
+        interactions=tuple(
+            fabricate_interaction(
+                rng, step, step // per_observation, observations[step // per_observation], plan, parts
+            )
+            for step in range(interactions)
+        ),
+    )
+
+
+def fabricate_rollouts(plan: Plan, job: Job, interactions: int = 8, per_observation: int = 8) -> list[RolloutRecord]:
+    """All rollouts of a job."""
+    return [fabricate_rollout(plan, index, interactions, per_observation) for index in range(job.start, job.stop)]
+
+
+def fabricate_observation(rng: np.random.Generator, points: int, pose: np.ndarray, parts: int) -> Observation:
+    """A cloud on a box's front, with some of it on each part."""
+    places = rng.uniform([-0.5, -0.6, -0.7], [-0.4, 0.6, 0.7], (points, 3))
+    normals = np.array([-1.0, 0.0, 0.0]) + rng.normal(scale=0.1, size=(points, 3))
+    part_ids = rng.integers(0, parts + 1, points, dtype=np.uint8)
+    part_ids[0] = parts
+    return Observation(
+        points=round_points(places),
+        normals=round_normals(normals / np.linalg.norm(normals, axis=1, keepdims=True)),
+        part_ids=part_ids,
+        movable=part_ids > 0,
+        pixels=rng.choice(448 * 448, points, replace=False).astype(np.uint32),
+        world_from_camera=pose,
+    )
+
+
+def fabricate_interaction(
+    rng: np.random.Generator, step: int, index: int, observation: Observation, plan: Plan, parts: int
+) -> InteractionRecord:
+    """A try at a movable point of the observation with this index."""
+    point = int(rng.choice(np.flatnonzero(observation.movable)))
+    normal = observation.normals[point].astype(np.float64)
+    normal /= np.linalg.norm(normal)
+    success = bool(rng.random() < 0.3)
+    kinds = [OutcomeKind.NO_CONTACT, OutcomeKind.START_COLLISION, OutcomeKind.WRONG_PART, OutcomeKind.HAND_CONTACT]
+    start = rng.uniform(0.0, 1.0)
+    motion = rng.uniform(0.02, 0.5) if success else 0.0
+    part = int(observation.part_ids[point])
+    return InteractionRecord(
+        step=step,
+        observation=index,
+        action=Action(
+            point_index=point,
+            point=observation.points[point].astype(np.float64),
+            rotation=gripper_rotation(-normal, rng.normal(size=3)),
+        ),
+        outcome=Outcome(
+            kind=OutcomeKind.OK if success else kinds[int(rng.integers(len(kinds)))],
+            motion=motion,
+            success=success,
+            start_joint_position=start,
+            end_joint_position=start + motion,
+            displacement=rng.normal(size=3) if success else np.full(3, np.nan),
+            steps=int(rng.integers(1, 1440)),
+        ),
+        normal=normal,
+        primitive=Primitive.PUSH,
+        order=Order.RESTART,
+        role=Role.COLLECT,
+        proposer=plan.proposer,
+        policy_version=plan.policy_version,
+        method="",
+        budget=-1,
+        target_part=part,
+        target_link=f"link_{part}",
+        target_joint=f"joint_{part}",
+        joint_positions=rng.uniform(0.0, 1.0, parts),
+        joint_limits=np.stack([np.zeros(parts), rng.uniform(1.0, 2.0, parts)], axis=1),
+        hand_start=rng.normal(size=7),
+        seconds=rng.uniform(0.01, 0.04),
+    )
