@@ -1,1 +1,6 @@
-"""Procedural objects in PartNet-Mobility's layout, so that a fresh machine needs no data set."""
+"""Procedural articulated objects in PartNet-Mobility's layout, for machines that have none of the real ones."""
+
+from collector.procedural.catalogue import CATEGORIES, build
+from collector.procedural.writing import generate
+
+__all__ = ["CATEGORIES", "build", "generate"]
