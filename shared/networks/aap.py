@@ -1,0 +1,118 @@
+"""AAP: the Adaptive Affordance Prediction module, and the oracle that it may learn from."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from shared.networks.actions import action_inputs, action_width, outcome_inputs, outcome_width
+from shared.networks.configuration import NetworkConfig
+from shared.networks.layers import Head, VectorEncoder
+from shared.networks.pointnet2 import PointNet2
+
+MIN_ATTENTION = 1e-4
+"""Keeps the weighted mean defined where every weight is tiny."""
+
+
+class Aap(nn.Module):
+    """Adaptive Affordance Prediction (AdaAfford, the section of that name).
+
+    Holds the adaptive information encoder E, the adaptive critic C and the adaptive affordance network D. They share
+    one PointNet++, and share nothing with the other modules ("the encoders do not share weights across different
+    modules"). D sees its features without passing a gradient back: it is supervised by C, and would otherwise bend
+    C's features towards its own regression.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width, latent = config.feature_width, config.latent_width
+        self.config = config
+        self.encoder = PointNet2(config)
+        self.action_encoder = VectorEncoder(action_width(config), config)
+        self.outcome_encoder = VectorEncoder(outcome_width(config), config)
+        self.code_head = Head((width, width, width), latent, config)
+        self.attention_head = Head((width, width, width), 1, config)
+        self.empty_latent = nn.Parameter(torch.zeros(latent))
+        self.critic_head = Head((width, width, latent), 1, config)
+        self.affordance_head = Head((width, latent), 1, config)
+
+    def interaction_codes(
+        self, features: Tensor, points: Tensor, frames: Tensor, motions: Tensor, successes: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What each interaction tells alone: z_I and w_I (AdaAfford, Adaptive Information Encoder).
+
+        Deviation: the paper's w is any real number, so that its sum may be zero; here it is positive (softplus).
+
+        Args:
+            features: f_p|O at each interaction's point, [..., feature_width].
+            points: p, [..., 3].
+            frames: approach and forward, [..., 6].
+            motions: m, [...].
+            successes: r as 0 or 1, [...].
+
+        Returns:
+            Codes [..., latent_width] and attention weights [...].
+        """
+        actions = self.action_encoder(action_inputs(points, frames, self.config))
+        outcomes = self.outcome_encoder(outcome_inputs(motions, successes, self.config))
+        weights = functional.softplus(self.attention_head(features, actions, outcomes)).squeeze(-1) + MIN_ATTENTION
+        codes: Tensor = self.code_head(features, actions, outcomes)
+        return codes, weights
+
+    def prefix_latents(self, codes: Tensor, weights: Tensor) -> Tensor:
+        """The z of every prefix of ordered interactions, in one pass: sum z_i w_i / sum w_i.
+
+        Deviation: the paper leaves z of no interactions undefined; here it is a learned constant, so that "AAP with no
+        tries" is a prediction like the others.
+
+        Args:
+            codes: [..., K, latent_width].
+            weights: [..., K].
+
+        Returns:
+            [..., K + 1, latent_width], from no interactions to all K.
+        """
+        sums = (codes * weights[..., None]).cumsum(dim=-2)
+        means = sums / weights.cumsum(dim=-1)[..., None]
+        return torch.cat([self.empty_latent.expand(*codes.shape[:-2], 1, -1), means], dim=-2)
+
+    def latent(self, codes: Tensor, weights: Tensor) -> Tensor:
+        """The z of a whole set, [latent_width], from codes [K, latent_width] and weights [K]; K may be 0."""
+        return self.prefix_latents(codes, weights)[-1]
+
+    def action_logits(self, features: Tensor, points: Tensor, frames: Tensor, latents: Tensor) -> Tensor:
+        """Logits of the AAP action score s_u|z (AdaAfford, Adaptive Critic Network), [...].
+
+        Args:
+            features: f_p|O, [..., feature_width].
+            points: p, [..., 3].
+            frames: approach and forward, [..., 6].
+            latents: z, [..., latent_width].
+
+        The leading axes of features, frames and latents broadcast.
+        """
+        actions = self.action_encoder(action_inputs(points, frames, self.config))
+        logits: Tensor = self.critic_head(features, actions, latents)
+        return logits.squeeze(-1)
+
+    def actionability(self, features: Tensor, latents: Tensor) -> Tensor:
+        """AAP actionability a_p|z in [0, 1] (AdaAfford, Adaptive Affordance Network), [...]; leading axes broadcast."""
+        logits: Tensor = self.affordance_head(features.detach(), latents.detach())
+        return torch.sigmoid(logits.squeeze(-1))
+
+
+class OracleEncoder(nn.Module):
+    """h: what cannot be seen, told outright, to z; the critic that it conditions bounds what adaptation can reach.
+
+    Not in the paper. Trained end to end, AAP tends to ignore z; where its critic first learns with z = h(hidden facts),
+    the information encoder then has something to infer.
+    """
+
+    def __init__(self, facts_width: int, config: NetworkConfig) -> None:
+        super().__init__()
+        self.first = VectorEncoder(facts_width, config)
+        self.second = nn.Linear(config.feature_width, config.latent_width)
+
+    def forward(self, facts: Tensor) -> Tensor:
+        """Facts [..., facts_width] to z, [..., latent_width]; bounded, so that it can be imitated."""
+        hidden: Tensor = self.second(functional.leaky_relu(self.first(facts)))
+        return torch.tanh(hidden)

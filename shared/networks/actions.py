@@ -1,0 +1,87 @@
+"""How actions and outcomes enter the networks: their numbers, in the view frame.
+
+A *frame* is the six numbers of a gripper's rotation: approach, then forward (Where2Act, by way of 6D rotations).
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from shared.networks.configuration import NetworkConfig
+
+FRAME_WIDTH = 6
+MOTION_SCALE = 0.01
+"""The motion that counts as a success, tau of the paper; log(1 + m / tau) spreads small motions out."""
+_DEGENERATE = 1e-6
+
+
+def action_width(config: NetworkConfig) -> int:
+    """How many numbers describe an action."""
+    return 12 if config.action_features else FRAME_WIDTH
+
+
+def action_inputs(points: Tensor, frames: Tensor, config: NetworkConfig) -> Tensor:
+    """The numbers that describe actions, [..., action_width].
+
+    Deviation from the paper, where `config.action_features` is set: p and the approach's moment p x d are added, in the
+    gravity-aligned view frame, since whether a push turns a hinge is linear in them.
+
+    Args:
+        points: p, [..., 3], broadcast against the frames.
+        frames: approach and forward, [..., 6].
+        config: the sizes.
+    """
+    if not config.action_features:
+        return frames
+    places = points.expand(*frames.shape[:-1], 3)
+    return torch.cat([frames, places, torch.linalg.cross(places, frames[..., :3])], dim=-1)
+
+
+def outcome_width(config: NetworkConfig) -> int:
+    """How many numbers describe an outcome."""
+    return 3 if config.outcome_features else 1
+
+
+def outcome_inputs(motions: Tensor, successes: Tensor, config: NetworkConfig) -> Tensor:
+    """The numbers that describe outcomes, [..., outcome_width].
+
+    Args:
+        motions: m, [...].
+        successes: r as 0 or 1, [...]; used only where `config.outcome_features` is set (a deviation: the paper has m).
+        config: the sizes.
+    """
+    if not config.outcome_features:
+        return motions[..., None]
+    return torch.stack([motions, torch.log1p(motions / MOTION_SCALE), successes], dim=-1)
+
+
+def orthonormal_frames(raw: Tensor) -> Tensor:
+    """Six free numbers to approach and forward, unit and at right angles (Gram-Schmidt), [..., 6].
+
+    Numbers that determine no rotation (a zero or a parallel pair) still give one, so that no weights can make an
+    action that is not a rotation.
+    """
+    approach = _unit(raw[..., :3], raw.new_tensor([1.0, 0.0, 0.0]))
+    forward = raw[..., 3:] - (raw[..., 3:] * approach).sum(dim=-1, keepdim=True) * approach
+    # The axis that the approach has least of is never parallel to it.
+    spare = functional.one_hot(approach.detach().abs().argmin(dim=-1), 3).to(raw.dtype)
+    spare = spare - (spare * approach).sum(dim=-1, keepdim=True) * approach
+    return torch.cat([approach, _unit(forward, functional.normalize(spare, dim=-1))], dim=-1)
+
+
+def geodesic_distance(frames: Tensor, others: Tensor) -> Tensor:
+    """Angle, rad, between rotations given as approach and forward, [..., 6] each."""
+    trace = sum((a * b).sum(dim=-1) for a, b in zip(_columns(frames), _columns(others), strict=True))
+    assert isinstance(trace, Tensor)
+    # The slope of the arc cosine is infinite at its ends, which equal rotations reach.
+    return torch.arccos(((trace - 1.0) / 2.0).clamp(-1.0 + 1e-6, 1.0 - 1e-6))
+
+
+def _columns(frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    approach, forward = frames[..., :3], frames[..., 3:]
+    return approach, forward, torch.linalg.cross(approach, forward)
+
+
+def _unit(x: Tensor, fallback: Tensor) -> Tensor:
+    length = x.norm(dim=-1, keepdim=True)
+    return torch.where(length > _DEGENERATE, x / length.clamp_min(_DEGENERATE), fallback)

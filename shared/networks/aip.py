@@ -1,0 +1,58 @@
+"""AIP: the Adaptive Interaction Proposal module."""
+
+from torch import Tensor, nn
+
+from shared.networks.actions import action_inputs, action_width
+from shared.networks.configuration import NetworkConfig
+from shared.networks.layers import Head, VectorEncoder
+from shared.networks.pointnet2 import PointNet2
+
+SCORE_SCALE = 0.02
+"""The usual size of a drop of the AAP loss; outputs are in units of it, so that untrained weights start near."""
+
+
+class Aip(nn.Module):
+    """Adaptive Interaction Proposal (AdaAfford, the section of that name): how much would a try tell?
+
+    Holds the AIP critic C and the AIP affordance network D over a PointNet++ of their own. D sees its features without
+    passing a gradient back, as in `shared.networks.aap.Aap`.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width, latent = config.feature_width, config.latent_width
+        self.config = config
+        self.encoder = PointNet2(config)
+        self.action_encoder = VectorEncoder(action_width(config), config)
+        self.score_encoder = VectorEncoder(1, config)
+        self.actionability_encoder = VectorEncoder(1, config)
+        self.critic_head = Head((width, width, width, latent), 1, config)
+        self.affordance_head = Head((width, width, latent), 1, config)
+
+    def action_scores(
+        self, features: Tensor, points: Tensor, frames: Tensor, latents: Tensor, aap_scores: Tensor
+    ) -> Tensor:
+        """AIP action scores s^AIP_u|z (AdaAfford, AIP Critic Network), [...], in nats of the AAP loss.
+
+        Args:
+            features: f_p|O of this module, [..., feature_width].
+            points: p, [..., 3].
+            frames: approach and forward, [..., 6].
+            latents: z, [..., latent_width].
+            aap_scores: s^AAP_u|z, probabilities, [...].
+        """
+        actions = self.action_encoder(action_inputs(points, frames, self.config))
+        scores: Tensor = self.critic_head(features, actions, self.score_encoder(aap_scores[..., None]), latents)
+        return SCORE_SCALE * scores.squeeze(-1)
+
+    def actionability(self, features: Tensor, latents: Tensor, aap_actionability: Tensor) -> Tensor:
+        """AIP actionability a^AIP_p|z of points (AdaAfford, AIP Affordance Network), [...].
+
+        Args:
+            features: f_p|O of this module, [..., feature_width].
+            latents: z, [..., latent_width].
+            aap_actionability: a^AAP_p|z in [0, 1], [...].
+        """
+        encoded = self.actionability_encoder(aap_actionability[..., None])
+        scores: Tensor = self.affordance_head(features.detach(), encoded, latents)
+        return SCORE_SCALE * scores.squeeze(-1)

@@ -1,0 +1,67 @@
+"""The sizes of the networks; every set of weights carries the configuration that it was made with."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from shared.configuration import StrictModel
+
+Width = Annotated[int, Field(ge=1, le=2048)]
+Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=8)]
+
+
+class NetworkConfig(StrictModel):
+    """Sizes of PointNet++ and of the heads; the defaults are the `small` configuration (see `NETWORKS`).
+
+    Levels are listed from fine to coarse in the first four settings, and from coarse to fine in `propagation`.
+    """
+
+    centres: Widths = (512, 128, 32)
+    """Points kept by each set abstraction."""
+    radii: tuple[Annotated[float, Field(gt=0, le=100)], ...] = (0.12, 0.3, 0.8)
+    """Of each set abstraction's neighbourhoods, in the cloud's units."""
+    neighbours: int = Field(16, ge=1, le=128)
+    """Neighbours that each centre looks at; as published: 32."""
+    abstraction: tuple[Widths, ...] = ((32, 32), (64, 64), (128, 128))
+    """Layer widths of each set abstraction."""
+    propagation: tuple[Widths, ...] = ((128,), (64,), (128, 128))
+    """Layer widths of each feature propagation; the last width is the point feature's."""
+    normalisation: Literal["layer", "batch"] = "layer"
+    """As published: batch. Its statistics drift with small batches; see `SetAbstraction` for where "layer" stands."""
+    feature_width: Width = 128
+    """Of f_p|O, of the encoded actions and outcomes, and of the hidden layers of the heads."""
+    latent_width: Width = 128
+    """Of z."""
+    noise_width: int = Field(10, ge=1, le=256)
+    """Of the Gaussian that the proposal network turns into rotations."""
+    action_features: bool = True
+    """Whether an action enters with p and p x d, beside approach and forward. As published: not."""
+    outcome_features: bool = True
+    """Whether an outcome enters with log(1 + m / tau) and r, beside the motion m. As published: not."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "NetworkConfig":
+        levels = len(self.centres)
+        if not len(self.radii) == len(self.abstraction) == len(self.propagation) == levels:
+            raise ValueError(f"radii, abstraction and propagation need {levels} entries each, one for each of centres")
+        if any(coarse > fine for fine, coarse in zip(self.centres, self.centres[1:], strict=False)):
+            raise ValueError(f"centres must not grow from level to level; given {self.centres}")
+        if self.propagation[-1][-1] != self.feature_width:
+            raise ValueError(f"propagation must end in feature_width ({self.feature_width})")
+        return self
+
+
+NETWORKS = {
+    "small": NetworkConfig(),
+    "published": NetworkConfig(
+        centres=(1024, 256, 64, 16),
+        radii=(0.1, 0.2, 0.4, 0.8),
+        neighbours=32,
+        abstraction=((32, 32, 64), (64, 64, 128), (128, 128, 256), (256, 256, 512)),
+        propagation=((256, 256), (256, 256), (256, 128), (128, 128, 128)),
+        normalisation="batch",
+        action_features=False,
+        outcome_features=False,
+    ),
+}
+"""Named configurations: "small" for clouds of about 2,048 points on a few cores, and "published"."""

@@ -1,0 +1,87 @@
+"""Multilayer perceptrons over the last axis, and heads over several inputs."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from shared.networks.configuration import NetworkConfig
+
+
+class Normalisation(nn.Module):
+    """Layer or batch normalisation of the last axis, whatever the leading axes are."""
+
+    def __init__(self, width: int, kind: str) -> None:
+        super().__init__()
+        self.norm: nn.Module = nn.BatchNorm1d(width) if kind == "batch" else nn.LayerNorm(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`x`, [..., width], normalised."""
+        if isinstance(self.norm, nn.BatchNorm1d):
+            return _as_tensor(self.norm(x.reshape(-1, x.shape[-1]))).reshape(x.shape)
+        return _as_tensor(self.norm(x))
+
+
+class PointwiseMlp(nn.Module):
+    """Linear, normalisation and ReLU, once a width: the shared perceptron of PointNet++; `kind` may be "none"."""
+
+    def __init__(self, width_in: int, widths: Sequence[int], kind: str, *, last_relu: bool = True) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for width in widths:
+            layers.append(nn.Linear(width_in, width, bias=kind == "none"))
+            if kind != "none":
+                layers.append(Normalisation(width, kind))
+            layers.append(nn.ReLU())
+            width_in = width
+        self.layers = nn.Sequential(*(layers if last_relu else layers[:-1]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[..., width_in] to [..., widths[-1]]."""
+        return _as_tensor(self.layers(x))
+
+
+class VectorEncoder(nn.Module):
+    """The MLP that encodes a vector into f_a (AdaAfford, Input Encoders): two layers, leaky ReLU between."""
+
+    def __init__(self, width_in: int, config: NetworkConfig) -> None:
+        super().__init__()
+        self.first = nn.Linear(width_in, config.feature_width)
+        self.second = nn.Linear(config.feature_width, config.feature_width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[..., width_in] to [..., feature_width]."""
+        return _as_tensor(self.second(functional.leaky_relu(self.first(x))))
+
+
+class Head(nn.Module):
+    """A two-layer perceptron with leaky ReLU over the concatenation of several inputs.
+
+    The first layer is kept as one matrix an input, whose products are added: the same function as one matrix on the
+    concatenation, except that inputs whose leading axes broadcast (a point's feature against a hundred rotations, or
+    an action against every latent) are multiplied once and never copied.
+    """
+
+    def __init__(self, widths_in: Sequence[int], width_out: int, config: NetworkConfig) -> None:
+        super().__init__()
+        whole = nn.Linear(sum(widths_in), config.feature_width)
+        # Drawn as one layer, so that the spread of the weights is that of the concatenation.
+        self.inputs = nn.ParameterList(
+            nn.Parameter(part.clone()) for part in torch.split(whole.weight.detach(), list(widths_in), dim=1)
+        )
+        self.bias = nn.Parameter(whole.bias.detach().clone())
+        self.output = nn.Linear(config.feature_width, width_out)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Inputs [..., width_in] with leading axes that broadcast, to [..., width_out]."""
+        hidden: Tensor = self.bias
+        for weight, x in zip(self.inputs, inputs, strict=True):
+            hidden = hidden + functional.linear(x, weight)
+        return _as_tensor(self.output(functional.leaky_relu(hidden)))
+
+
+def _as_tensor(x: object) -> Tensor:
+    """What a module returned; torch types every module's result as Any."""
+    assert isinstance(x, torch.Tensor)
+    return x

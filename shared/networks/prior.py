@@ -1,0 +1,58 @@
+"""The prior: Where2Act's proposal, critic and affordance networks over one PointNet++."""
+
+import torch
+from torch import Tensor, nn
+
+from shared.networks.actions import FRAME_WIDTH, action_inputs, action_width, orthonormal_frames
+from shared.networks.configuration import NetworkConfig
+from shared.networks.layers import Head, VectorEncoder
+from shared.networks.pointnet2 import PointNet2
+
+
+class Prior(nn.Module):
+    """Where2Act (ICCV 2021): what vision alone says of an action, and which rotations are worth trying.
+
+    Attributes:
+        encoder: the point features, shared by the three heads as in Where2Act, and with no other module.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width = config.feature_width
+        self.config = config
+        self.encoder = PointNet2(config)
+        self.action_encoder = VectorEncoder(action_width(config), config)
+        self.proposal_head = Head((width, config.noise_width), FRAME_WIDTH, config)
+        self.critic_head = Head((width, width), 1, config)
+        self.affordance_head = Head((width,), 1, config)
+
+    def propose(self, features: Tensor, noise: Tensor) -> Tensor:
+        """Rotations at points (Where2Act, Action Proposal Network).
+
+        Args:
+            features: f_p|O, [..., 1, feature_width].
+            noise: standard normal, [..., S, noise_width].
+
+        Returns:
+            Approach and forward of S rotations a point, [..., S, 6].
+        """
+        return orthonormal_frames(self.proposal_head(features, noise))
+
+    def action_logits(self, features: Tensor, points: Tensor, frames: Tensor) -> Tensor:
+        """Logits of the action score s_u (Where2Act, Action Scoring Network), [...]; `torch.sigmoid` gives the score.
+
+        Args:
+            features: f_p|O, [..., feature_width], broadcast against the frames.
+            points: p, [..., 3], broadcast against the frames.
+            frames: approach and forward, [..., 6].
+        """
+        actions = self.action_encoder(action_inputs(points, frames, self.config))
+        return _single(self.critic_head(features, actions))
+
+    def actionability(self, features: Tensor) -> Tensor:
+        """Actionability a_p in [0, 1] of points with features [..., feature_width] (Where2Act), [...]."""
+        return torch.sigmoid(_single(self.affordance_head(features)))
+
+
+def _single(x: Tensor) -> Tensor:
+    return x.squeeze(-1)
