@@ -40,7 +40,7 @@ WorkerFactory = Callable[[], Worker]
 """Makes a worker in the process that will use it; must be picklable for a fleet of processes."""
 
 
-class JobFailure(WorkerError):
+class JobError(WorkerError):
     """A job failed as often as it may.
 
     Attributes:
@@ -68,7 +68,7 @@ class Fleet(Protocol):
         """Execute `jobs`, in any order, and report each once.
 
         Raises:
-            JobFailure: a job failed `MAX_ATTEMPTS` times for reasons of infrastructure.
+            JobError: a job failed `MAX_ATTEMPTS` times for reasons of infrastructure.
             AdaAffordError: a worker met a problem that the user must solve; it is not tried again.
         """
         ...
@@ -115,7 +115,7 @@ class SerialFleet:
                 logger.warning("job %s failed", job.shard_id, exc_info=True)
                 self._worker = None
                 reason = describe(error)
-        raise JobFailure(job, reason)
+        raise JobError(job, reason)
 
     def _live_worker(self) -> Worker:
         """The worker, made and given all policies if there is none yet."""

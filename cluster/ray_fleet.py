@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import ray
 from ray.exceptions import RayActorError, RayTaskError
 
-from cluster.fleet import MAX_ATTEMPTS, JobFailure, WorkerFactory, describe
+from cluster.fleet import MAX_ATTEMPTS, JobError, WorkerFactory, describe
 from collector.actor import WorkerActor
 from shared.errors import AdaAffordError
 from shared.plan import Job, Plan
@@ -138,7 +138,7 @@ class RayFleet:
         logger.warning("job %s failed: %s", job.shard_id, reason)
         attempts[job] += 1
         if attempts[job] >= MAX_ATTEMPTS:
-            raise JobFailure(job, reason)
+            raise JobError(job, reason)
 
     def _start(self) -> Any:
         """A new actor. No restarts by Ray: those would run only `__init__` again, and lose what was in flight."""

@@ -32,18 +32,23 @@ logger = logging.getLogger(__name__)
 def fleets(workers: int, job_limit_s: float, address: str | None = None) -> Iterator[FleetMaker]:
     """A maker of fleets that live at most as long as the context: serial if `workers` is 0, else on Ray.
 
+    Ray starts with the first fleet, so that what needs none does not wait for it.
+
     Args:
         workers: how many actors a fleet has; 0 does without Ray.
         job_limit_s: see `cluster.ray_fleet.RayFleet`.
         address: of a running Ray cluster; None starts a session of our own on this machine.
     """
     with ExitStack() as stack:
-        if workers > 0:
-            stack.enter_context(ray_session(workers, address))
+        begun = False
 
         def make(make_worker: WorkerFactory) -> Fleet:
+            nonlocal begun
             if workers == 0:
                 return SerialFleet(make_worker)
+            if not begun:
+                stack.enter_context(ray_session(workers, address))
+                begun = True
             from cluster.ray_fleet import RayFleet
 
             fleet = RayFleet(make_worker, workers, job_limit_s)
@@ -109,7 +114,7 @@ def _start_on_loopback(workers: int) -> None:
 
 
 def _quieten() -> None:
-    """Send what raylets would print on our terminal (such as the end of an actor that we report ourselves) to the log."""
+    """Send what raylets would print on our terminal to the log: the end of an actor, say, which we report ourselves."""
     from ray._private import worker
 
     def to_log(data: dict[str, Any], ignore_prefix: bool = False) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cluster.fleet import Fleet, JobFailure, WorkerFactory
+from cluster.fleet import Fleet, JobError, WorkerFactory
 from cluster.session import fleets
 from collector.worker import Receipt
 from shared.configuration import CollectionConfig
@@ -82,7 +82,7 @@ def test_a_failure_of_infrastructure_is_tried_again(fleet: Fleet, tmp_path: Path
 
 def test_a_job_that_always_fails_ends_the_run_after_three_attempts(fleet: Fleet, tmp_path: Path) -> None:
     (tmp_path / "raise-1").write_text("99")
-    with pytest.raises(JobFailure, match=r"^job random-v0-00000001-00000002 failed 3 times; last: RuntimeError: .*$"):
+    with pytest.raises(JobError, match=r"^job random-v0-00000001-00000002 failed 3 times; last: RuntimeError: .*$"):
         run(fleet, 3)
     assert begun(tmp_path, jobs(3)[1]) == 3
 

@@ -1,0 +1,183 @@
+"""The campaign: the alternation of collection and training as a list of stages over one folder.
+
+    objects, collect-random, train-prior,
+    train-aap-1, train-aip-1, publish-1,
+    collect-aip-1, train-aap-2, train-aip-2, publish-2, ...
+    evaluate, report
+
+The same live workers serve every collection round; each round's policy reaches them by version.
+"""
+
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from cluster.collection import Collected, collect
+from cluster.configuration import CampaignConfig
+from cluster.fleet import Fleet
+from cluster.ledger import Ledger
+from cluster.locking import only_driver
+from cluster.objects import objects_for
+from cluster.run_folder import ObjectsUsed, RunFolder
+from cluster.session import FleetMaker, fleets
+from cluster.stages import Stage, run_stages
+from cluster.training import Trainer
+from collector.catalogue import split
+from collector.worker import Worker
+from shared.errors import UsageError
+from shared.files import write_atomically
+from shared.plan import Plan, Setting
+from shared.store import Store
+from shared.tasks import task_named
+
+
+class Crew:
+    """The live fleet: one at a time, since each worker holds a CPU; kept as long as the store stays the same."""
+
+    def __init__(self, make_fleet: FleetMaker) -> None:
+        self._make_fleet = make_fleet
+        self._fleet: Fleet | None = None
+        self._of: tuple[Path, Path] | None = None
+
+    def for_store(self, store: Path, objects: Path) -> Fleet:
+        """The fleet whose workers write to `store`."""
+        if self._fleet is None or self._of != (store, objects):
+            self.dismiss()
+            self._fleet, self._of = self._make_fleet(partial(Worker, store, objects)), (store, objects)
+        return self._fleet
+
+    def dismiss(self) -> None:
+        """End the workers."""
+        if self._fleet is not None:
+            self._fleet.close()
+        self._fleet = None
+
+
+class Campaign:
+    """One run, from nothing or from wherever it was stopped to its report."""
+
+    def __init__(self, run: RunFolder, config: CampaignConfig) -> None:
+        self._run = run
+        self._config = config
+        self._console = Console(file=sys.stderr, highlight=False)
+        self._trainer = Trainer(run, config, self._say)
+
+    def execute(self) -> None:
+        """Do what is left to do.
+
+        Raises:
+            AdaAffordError: a stage cannot go on; what was done stays done.
+        """
+        config = self._config
+        with only_driver(self._run.path):
+            ledger = Ledger(self._run.log)
+            ledger.note("attempt", workers=config.workers)
+            with fleets(config.workers, config.job_limit_s, config.ray_address) as make_fleet:
+                run_stages(self.stages(Crew(make_fleet)), ledger, self._say)
+            from cluster.report import print_report
+
+            print_report(self._run)
+
+    def stages(self, crew: Crew) -> list[Stage]:
+        """All stages, in order."""
+        trainer = self._trainer
+        stages = [
+            Stage("objects", self._choose_objects),
+            Stage("collect-random", partial(self._collect, crew, "random", 0, self._config.rollouts.random)),
+            Stage("train-prior", trainer.prior),
+        ]
+        for version in range(1, self._config.alternations + 2):
+            if version > 1:
+                count = self._config.rollouts.aip
+                stages.append(
+                    Stage(f"collect-aip-{version - 1}", partial(self._collect, crew, "aip", version - 1, count))
+                )
+            stages += [
+                Stage(f"train-aap-{version}", partial(trainer.aap, version)),
+                Stage(f"train-aip-{version}", partial(trainer.aip, version)),
+                Stage(f"publish-{version}", partial(trainer.publish, version)),
+            ]
+        final = self._config.alternations + 1
+        return [*stages, Stage("evaluate", partial(self._evaluate, crew, final)), Stage("report", self._report)]
+
+    def _choose_objects(self) -> Mapping[str, Any]:
+        """Decide which objects are trained on and which are kept for the end, and make both stores."""
+        run, config = self._run, self._config
+        task = task_named(config.task)
+        per_category = config.procedural.per_category
+        catalogue, folder = objects_for(
+            task, config.objects, run.generated_objects.resolve(), per_category, config.seed
+        )
+        parts = split((entry.ref for entry in catalogue.usable), config.splits.fractions, config.seed)
+        if not parts.train or not parts.test:
+            raise UsageError(
+                f"{folder}: {len(catalogue.usable)} usable objects are too few to train on some and test on others"
+            )
+        used = ObjectsUsed(
+            folder=str(folder),
+            train=parts.train,
+            validation=parts.validation,
+            test=parts.test,
+            refused=catalogue.refused,
+        )
+        write_atomically(run.objects_file, used.model_dump_json(indent=2).encode())
+        Store.create(run.store, self._setting(used, evaluation=False))
+        Store.create(run.evaluation, self._setting(used, evaluation=True))
+        counts = {name: len(refs) for name, refs in (("train", used.train), ("validation", used.validation))}
+        counts |= {"test": len(used.test), "refused": len(used.refused)}
+        self._say(f"objects: {', '.join(f'{count} {name}' for name, count in counts.items())}; reasons in objects.json")
+        return counts
+
+    def _setting(self, used: ObjectsUsed, *, evaluation: bool) -> Setting:
+        config = self._config
+        objects = used.test if evaluation else (*used.train, *used.validation)
+        return Setting(
+            kind="evaluation" if evaluation else "collection",
+            task=config.task,
+            seed=config.seed,
+            objects=tuple(sorted(objects, key=lambda ref: ref.id)),
+            collection=config.collection,
+            evaluation=config.evaluation if evaluation else None,
+        )
+
+    def _collect(self, crew: Crew, proposer: str, version: int, rollouts: int) -> Mapping[str, Any]:
+        """One collection round."""
+        return self._fill(crew, self._run.store, proposer, version, rollouts)
+
+    def _evaluate(self, crew: Crew, version: int) -> Mapping[str, Any]:
+        """Try every method on unseen objects with the last policy, then ask the critics about the rest."""
+        evaluation = Store.open(self._run.evaluation)
+        evaluation.publish_policy(version, Store.open(self._run.store).read_policy(version))
+        collected = self._fill(crew, self._run.evaluation, "evaluation", version, self._config.rollouts.evaluation)
+        crew.dismiss()
+        return collected | self._trainer.evaluate(version)
+
+    def _fill(self, crew: Crew, path: Path, proposer: str, version: int, rollouts: int) -> dict[str, Any]:
+        store, used = Store.open(path), self._run.objects_used()
+        store.sweep()
+        plan = Plan(setting=store.setting, proposer=proposer, policy_version=version)
+        folder = Path(used.folder)
+        open_fleet = partial(crew.for_store, path, folder)
+        with only_driver(path):
+            collected = collect(store, plan, rollouts, self._config.rollouts.per_shard, open_fleet, folder)
+        return _figures(collected)
+
+    def _report(self) -> Mapping[str, Any]:
+        """Write summary.json and affordance.png."""
+        from cluster.report import write_report
+
+        write_report(self._run, self._config)
+        return {}
+
+    def _say(self, line: str) -> None:
+        self._console.print(line, markup=False, soft_wrap=True)
+
+
+def _figures(collected: Collected) -> dict[str, Any]:
+    """What the ledger notes of a collection: of the last attempt alone, as the wall time is."""
+    return {"tally": asdict(collected.tally), "wall_s": collected.seconds, "workers": collected.workers}

@@ -1,0 +1,75 @@
+"""The command line `adaafford`: finds the subcommand, and turns errors into one line and an exit code.
+
+Heavy packages are imported by the subcommands that need them, so that help is instant.
+"""
+
+import os
+import signal
+import sys
+from importlib import import_module
+from typing import NoReturn
+
+from shared.errors import AdaAffordError
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as a shell has it."""
+
+COMMANDS = {
+    "run": "collect, train, collect with what was learnt, evaluate: a whole campaign",
+    "resume": "go on with a run that was stopped",
+    "report": "print a run's results again",
+    "collect": "collect interactions into a store, without any learning",
+    "store": "info, verify, digest or replay: look into a store",
+    "objects": "generate, check or preview: the objects",
+    "version": "print the version",
+}
+"""Subcommands, each a module of `cluster.commands` with `main(args) -> int`."""
+
+USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells more\n\n" + "\n".join(
+    f"  {name:<9}{text}" for name, text in COMMANDS.items()
+)
+
+
+def main() -> NoReturn:
+    """Run the command line of this process and exit."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(args: list[str]) -> int:
+    """Run one command line; returns its exit code."""
+    if not args or args[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0 if args else 2
+    name, rest = args[0], args[1:]
+    if name == "--version":
+        name = "version"
+    if name not in COMMANDS:
+        return _complain(f"unknown command '{name}'; allowed: {', '.join(COMMANDS)}", 2)
+    try:
+        code: int = import_module(f"cluster.commands.{name}").main(rest)
+        sys.stdout.flush()
+    except AdaAffordError as error:
+        return _complain(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        return _interrupted(name, args)
+    except BrokenPipeError:
+        # Whoever read our output has enough (`adaafford ... | head`); keep Python from complaining at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+    return code
+
+
+def _interrupted(name: str, args: list[str]) -> int:
+    """Say how to go on after Ctrl-C."""
+    hint = "; what is committed stays, and the same command goes on" if name in ("run", "resume", "collect") else ""
+    print(
+        f"adaafford: interrupted{hint}: adaafford {' '.join(args)}" if hint else "adaafford: interrupted",
+        file=sys.stderr,
+    )
+    return INTERRUPTED
+
+
+def _complain(message: str, code: int) -> int:
+    """Print one line."""
+    print(f"adaafford: {' '.join(message.split())}", file=sys.stderr)
+    return code

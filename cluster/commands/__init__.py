@@ -1,0 +1,1 @@
+"""The subcommands of `adaafford`, a module each."""

@@ -1,0 +1,96 @@
+"""`adaafford collect`: collection alone, into one store."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from pydantic import Field
+
+from cluster.settings import early_flags, layered, parse_flags
+from shared.configuration import CollectionConfig, StrictModel
+from shared.errors import UsageError
+from shared.tasks import task_named
+
+
+class CollectSettings(StrictModel):
+    """What `adaafford collect` may be told by a file as well."""
+
+    task: str = "push"
+    """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
+    objects: Path | None = None
+    """A folder of objects in PartNet-Mobility's layout; built-in procedural objects where none is given."""
+    rollouts: int = Field(100, ge=1)
+    """How many the store shall hold of this plan, those of earlier attempts included."""
+    per_shard: int = Field(2, ge=1, le=4096)
+    """Rollouts a shard."""
+    seed: int = Field(1, ge=0, lt=2**63)
+    """Everything random derives from it."""
+    workers: int = Field(2, ge=0, le=4096)
+    """Ray actors, one CPU each; 0 does everything in one process without Ray."""
+    ray_address: str | None = None
+    """Of a running Ray cluster; a private session on this machine where none is given."""
+    job_limit_s: float = Field(300.0, gt=0)
+    """A worker that takes longer for one job is taken for hung, and replaced."""
+    procedural_per_category: int = Field(8, ge=1, le=10_000)
+    """Built-in objects: how many of each category that the task applies to."""
+    collection: CollectionConfig = CollectionConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class CollectCommand:
+    """Collect interactions into a store. The same command again goes on where it was stopped."""
+
+    settings: Annotated[CollectSettings, tyro.conf.arg(name="")]
+    store: Path
+    """Folder of the store: new, or of the same setting."""
+    proposer: Literal["random", "aip"] = "random"
+    """Who chooses the interactions."""
+    policy: int = 0
+    """Version of the policy in the store that the proposer uses; "aip" needs one."""
+    config: Path | None = None
+    """A TOML file of settings; flags are laid over it."""
+
+
+def main(args: list[str]) -> int:
+    """Collect."""
+    early = early_flags(args, "config")
+    config = Path(early["config"]) if early["config"] else None
+    defaults = CollectCommand(layered(CollectSettings, None, config), tyro.MISSING, config=config)
+    command = parse_flags(CollectCommand, args, "collect", defaults)
+    task_named(command.settings.task)
+    if (command.proposer == "aip") != (command.policy > 0):
+        raise UsageError("the proposer 'aip' needs --policy VERSION (1 or more), and 'random' takes none")
+    _collect(command)
+    return 0
+
+
+def _collect(command: CollectCommand) -> None:
+    from cluster.collection import collect
+    from cluster.locking import only_driver
+    from cluster.objects import objects_for
+    from cluster.session import fleets
+    from collector.worker import Worker
+    from shared.plan import Plan, Setting
+    from shared.store import Store
+
+    chosen, path = command.settings, command.store.resolve()
+    catalogue, folder = objects_for(
+        task_named(chosen.task),
+        chosen.objects,
+        path.with_name(f"{path.name}-objects"),
+        chosen.procedural_per_category,
+        chosen.seed,
+    )
+    setting = Setting(
+        task=chosen.task,
+        seed=chosen.seed,
+        objects=tuple(entry.ref for entry in catalogue.usable),
+        collection=chosen.collection,
+    )
+    store = Store.create(path, setting)
+    plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
+    with only_driver(path), fleets(chosen.workers, chosen.job_limit_s, chosen.ray_address) as make_fleet:
+        open_fleet = partial(make_fleet, partial(Worker, path, folder))
+        collect(store, plan, chosen.rollouts, chosen.per_shard, open_fleet, folder)

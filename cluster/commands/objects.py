@@ -1,0 +1,105 @@
+"""`adaafford objects`: make objects, check them, look at them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from pydantic import Field
+
+from cluster.settings import parse_flags
+from shared.errors import UsageError
+
+ACTIONS = ("generate", "check", "preview")
+
+
+@dataclass(frozen=True, slots=True)
+class GenerateCommand:
+    """Make built-in procedural objects in PartNet-Mobility's layout."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of the objects; what is there already is kept."""
+    per_category: Annotated[int, Field(ge=1)] = 4
+    """Objects of each category."""
+    categories: tuple[str, ...] = ()
+    """Only these; all where none is named."""
+    seed: int = 1
+    """Everything random derives from it."""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckCommand:
+    """Say of each object in one line whether it can be used, or why not; the exit code is 2 if none can."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A folder of objects, or one object's folder."""
+    task: str | None = None
+    """Say as well which objects suit this task."""
+
+
+@dataclass(frozen=True, slots=True)
+class PreviewCommand:
+    """Draw a contact sheet: the body grey, every movable part in a colour of its own."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A folder of objects, or one object's folder."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """The picture, a PNG."""
+    most: int = 100
+    """Objects drawn, at the most."""
+
+
+def main(args: list[str]) -> int:
+    """Dispatch."""
+    match args[:1]:
+        case ["generate"]:
+            return _generate(parse_flags(GenerateCommand, args[1:], "objects generate"))
+        case ["check"]:
+            return _check(parse_flags(CheckCommand, args[1:], "objects check"))
+        case ["preview"]:
+            return _preview(parse_flags(PreviewCommand, args[1:], "objects preview"))
+        case ["-h" | "--help"]:
+            print(f"usage: adaafford objects {{{','.join(ACTIONS)}}} PATH; `adaafford objects check --help` tells more")
+            return 0
+    given = f"'{args[0]}'" if args else "nothing"
+    raise UsageError(f"objects needs one of {', '.join(ACTIONS)}; given {given}")
+
+
+def _generate(command: GenerateCommand) -> int:
+    from collector.procedural.catalogue import CATEGORIES
+    from collector.procedural.writing import generate
+
+    counts = dict.fromkeys(command.categories or CATEGORIES, command.per_category)
+    made = generate(command.out, counts, command.seed)
+    print(f"{len(made)} objects of {len(counts)} categories in {command.out}")
+    return 0
+
+
+def _check(command: CheckCommand) -> int:
+    from collector.catalogue import for_task, scan
+    from shared.tasks import task_named
+
+    catalogue = scan(command.path)
+    if command.task is not None:
+        catalogue = for_task(catalogue, task_named(command.task))
+    lines = {entry.ref.id: f"usable: {entry.ref.category}, {_parts(len(entry.parts))}" for entry in catalogue.usable}
+    lines |= {object_id: f"refused: {reason}" for object_id, reason in catalogue.refused}
+    for object_id in sorted(lines):
+        print(f"{object_id}  {lines[object_id]}")
+    print(f"{len(catalogue.usable)} usable, {len(catalogue.refused)} refused")
+    return 0 if catalogue.usable else UsageError.exit_code
+
+
+def _preview(command: PreviewCommand) -> int:
+    from collector.catalogue import load, scan
+    from collector.preview import contact_sheet
+
+    usable = scan(command.path).usable
+    shown = usable[: command.most]
+    contact_sheet([load(entry) for entry in shown], command.out)
+    print(f"{command.out}: {len(shown)} of {len(usable)} usable objects")
+    return 0
+
+
+def _parts(count: int) -> str:
+    return f"{count} movable part{'' if count == 1 else 's'}"

@@ -1,0 +1,41 @@
+"""`adaafford run`: a whole campaign in one command."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from cluster.configuration import CampaignConfig
+from cluster.settings import early_flags, layered, parse_flags
+from shared.tasks import task_named
+
+
+@dataclass(frozen=True, slots=True)
+class RunCommand:
+    """Collect at random, train, collect with what was learnt, fine-tune, and evaluate on unseen objects.
+
+    The same command again goes on where it was stopped.
+    """
+
+    settings: Annotated[CampaignConfig, tyro.conf.arg(name="")]
+    out: Path
+    """Folder of the run: new, empty, or of the same run."""
+    preset: str = "smoke"
+    """A set of settings that the package brings: smoke or laptop."""
+    config: Path | None = None
+    """A TOML file of settings, laid over the preset; flags are laid over both."""
+
+
+def main(args: list[str]) -> int:
+    """Run, or go on with, a campaign."""
+    early = early_flags(args, "preset", "config")
+    preset, config = early["preset"] or "smoke", Path(early["config"]) if early["config"] else None
+    defaults = RunCommand(layered(CampaignConfig, preset, config), tyro.MISSING, preset, config)
+    command = parse_flags(RunCommand, args, "run", defaults)
+    task_named(command.settings.task)
+    from cluster.campaign import Campaign
+    from cluster.run_folder import begin
+
+    Campaign(begin(command.out, command.settings), command.settings).execute()
+    return 0

@@ -1,0 +1,153 @@
+"""`adaafford store`: look into a store."""
+
+import json
+import math
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from cluster.settings import parse_flags
+from shared.errors import UsageError
+
+ACTIONS = ("info", "verify", "digest", "replay")
+
+
+@dataclass(frozen=True, slots=True)
+class InfoCommand:
+    """Say what a store holds."""
+
+    store: Annotated[Path, tyro.conf.Positional]
+    """Folder of the store."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True, slots=True)
+class VerifyCommand:
+    """Recompute everything that a store claims; the exit code is 1 if anything is wrong."""
+
+    store: Annotated[Path, tyro.conf.Positional]
+    """Folder of the store."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True, slots=True)
+class DigestCommand:
+    """Print the content digest as the last line: the same for the same interactions, whoever made them, and when."""
+
+    store: Annotated[Path, tyro.conf.Positional]
+    """Folder of the store."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayCommand:
+    """Execute one job in this process, without Ray, to see why it fails; it is committed if it does not."""
+
+    store: Annotated[Path, tyro.conf.Positional]
+    """Folder of the store."""
+    shard: Annotated[str, tyro.conf.Positional]
+    """The shard that the job makes, such as random-v0-00000000-00000002."""
+    objects: Path
+    """Folder of the objects that the store was made with."""
+
+
+def main(args: list[str]) -> int:
+    """Dispatch."""
+    match args[:1]:
+        case ["info"]:
+            return _info(parse_flags(InfoCommand, args[1:], "store info"))
+        case ["verify"]:
+            return _verify(parse_flags(VerifyCommand, args[1:], "store verify"))
+        case ["digest"]:
+            return _digest(parse_flags(DigestCommand, args[1:], "store digest"))
+        case ["replay"]:
+            return _replay(parse_flags(ReplayCommand, args[1:], "store replay"))
+        case ["-h" | "--help"]:
+            print(f"usage: adaafford store {{{','.join(ACTIONS)}}} STORE; `adaafford store info --help` tells more")
+            return 0
+    given = f"'{args[0]}'" if args else "nothing"
+    raise UsageError(f"store needs one of {', '.join(ACTIONS)}; given {given}")
+
+
+def _info(command: InfoCommand) -> int:
+    from shared.store import Store, Tally, info
+
+    store = Store.open(command.store)
+    held = info(store)
+    if command.json:
+        described = asdict(held) | {
+            "bytes_per_interaction": held.bytes_per_interaction,
+            "task": store.setting.task,
+            "kind": store.setting.kind,
+            "seed": store.setting.seed,
+            "objects": len(store.setting.objects),
+            "policy_versions": store.policy_versions(),
+        }
+        print(json.dumps(_finite(described), indent=2, allow_nan=False))
+        return 0
+
+    def tallies(counts: dict[str, Tally]) -> str:
+        return ", ".join(f"{name} {tally.interactions} ({tally.success_rate:.1%})" for name, tally in counts.items())
+
+    print(f"{command.store}: {store.setting.kind}, task {store.setting.task}, seed {store.setting.seed}")
+    print(f"  objects       {len(store.setting.objects)}")
+    print(f"  shards        {held.shards}, {held.bytes / 1e6:.1f} MB, {held.bytes_per_interaction:.0f} B/interaction")
+    print(f"  rollouts      {held.rollouts}: {', '.join(f'{name} {n}' for name, n in held.by_status.items())}")
+    print(f"  interactions  {held.interactions}, on {held.observations} observations")
+    print(f"  outcomes      {', '.join(f'{name} {n}' for name, n in held.by_outcome.items())}")
+    print(f"  proposers     {tallies(held.by_proposer)}")
+    print(f"  roles         {tallies(held.by_role)}")
+    print(f"  categories    {tallies(held.by_category)}")
+    print(f"  policies      {', '.join(map(str, store.policy_versions())) or 'none'}")
+    return 0
+
+
+def _verify(command: VerifyCommand) -> int:
+    from shared.store import Store, verify
+
+    store = Store.open(command.store)
+    problems = verify(store)
+    shards = len(store.committed()) if not problems else None
+    if command.json:
+        print(json.dumps({"ok": not problems, "problems": [asdict(problem) for problem in problems]}, indent=2))
+    else:
+        for problem in problems:
+            print(f"{problem.where}: {problem.what}")
+        print(f"{len(problems)} problems" if problems else f"no problems in {shards} shards")
+    return 1 if problems else 0
+
+
+def _digest(command: DigestCommand) -> int:
+    from shared.store import Store
+
+    print(Store.open(command.store).digest())
+    return 0
+
+
+def _replay(command: ReplayCommand) -> int:
+    from collector.worker import Worker
+    from shared.store import Store
+    from shared.store.layout import parse_shard_id
+
+    store, job = Store.open(command.store), parse_shard_id(command.shard)
+    if job is None:
+        raise UsageError(f"'{command.shard}' names no shard; names look like random-v0-00000000-00000002")
+    plans = {plan.key: plan for plan in store.plans()}
+    if job.plan_key not in plans:
+        raise UsageError(f"{command.store} has no plan '{job.plan_key}'; it has: {', '.join(plans) or 'none'}")
+    print(f"running {job.shard_id}", file=sys.stderr)
+    print(Worker(command.store, command.objects).run(plans[job.plan_key], job))
+    return 0
+
+
+def _finite(value: Any) -> Any:
+    """The value with null for what JSON cannot say (a rate of nothing)."""
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

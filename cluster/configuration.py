@@ -1,0 +1,80 @@
+"""The configuration of a campaign: everything that decides what a run produces, and how many workers do it."""
+
+from pathlib import Path
+
+from pydantic import Field, field_validator, model_validator
+
+from shared.configuration import CollectionConfig, StrictModel
+from shared.plan import EvaluationConfig
+
+EXECUTION_SETTINGS = frozenset({"workers", "ray_address", "job_limit_s"})
+"""Settings that do not change what a run produces; they may differ from one attempt to the next."""
+
+
+class RolloutCounts(StrictModel):
+    """How many rollouts each round makes."""
+
+    random: int = Field(100, ge=1)
+    """In the first round, proposed at random."""
+    aip: int = Field(30, ge=1)
+    """In each later round, proposed by AIP."""
+    evaluation: int = Field(8, ge=1)
+    """On test objects, which are not trained on."""
+    per_shard: int = Field(2, ge=1, le=4096)
+    """A job's size: what a worker does in one go, and what a kill can cost."""
+
+
+class SplitConfig(StrictModel):
+    """Shares of the objects, within each category."""
+
+    train: float = Field(0.7, gt=0, le=1)
+    validation: float = Field(0.1, ge=0, le=1)
+    test: float = Field(0.2, gt=0, le=1)
+
+    @property
+    def fractions(self) -> tuple[float, float, float]:
+        """Of train, validation and test."""
+        return self.train, self.validation, self.test
+
+    @model_validator(mode="after")
+    def _whole(self) -> "SplitConfig":
+        if abs(sum(self.fractions) - 1) > 1e-6:
+            raise ValueError(f"train, validation and test must sum to 1; given {self.fractions}")
+        return self
+
+
+class ProceduralConfig(StrictModel):
+    """The built-in objects that are generated where no folder of objects is given."""
+
+    per_category: int = Field(8, ge=1, le=10_000)
+    """Objects of each category that the task applies to."""
+
+
+class CampaignConfig(StrictModel):
+    """One campaign: a random round, then alternating training and AIP rounds, then evaluation on unseen objects."""
+
+    task: str = "pull-closed-door"
+    """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
+    objects: Path | None = None
+    """A folder of objects in PartNet-Mobility's layout; built-in procedural objects where none is given."""
+    seed: int = Field(1, ge=0, lt=2**63)
+    """Everything random derives from it."""
+    alternations: int = Field(1, ge=0, le=1000)
+    """AIP rounds, each followed by training."""
+    rollouts: RolloutCounts = RolloutCounts()
+    splits: SplitConfig = SplitConfig()
+    procedural: ProceduralConfig = ProceduralConfig()
+    collection: CollectionConfig = CollectionConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+    workers: int = Field(2, ge=0, le=4096)
+    """Ray actors, one CPU each; 0 does everything in one process without Ray."""
+    ray_address: str | None = None
+    """Of a running Ray cluster; a private session on this machine where none is given."""
+    job_limit_s: float = Field(300.0, gt=0)
+    """A worker that takes longer for one job is taken for hung, and replaced."""
+
+    @field_validator("objects")
+    @classmethod
+    def _absolute(cls, path: Path | None) -> Path | None:
+        """The run may be resumed from another working folder."""
+        return None if path is None else path.expanduser().resolve()

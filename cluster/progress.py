@@ -1,0 +1,129 @@
+"""Progress of a collection: a live bar on a terminal, plain lines every few seconds elsewhere."""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from rich.progress import Task
+
+    from collector.worker import Receipt
+
+LINE_EVERY_S = 5.0
+
+
+@dataclass(slots=True)
+class Tally:
+    """What receipts add up to, of this attempt alone."""
+
+    rollouts: int = 0
+    interactions: int = 0
+    successes: int = 0
+    outcomes: dict[str, int] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Of all workers together, by stage."""
+
+    def add(self, receipt: "Receipt") -> None:
+        """Count one receipt."""
+        self.rollouts += receipt.rollouts
+        self.interactions += receipt.interactions
+        self.successes += receipt.successes
+        for name, count in receipt.outcomes.items():
+            self.outcomes[name] = self.outcomes.get(name, 0) + count
+        for name, seconds in receipt.seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+
+    @property
+    def success_rate(self) -> float:
+        """Of the interactions so far; 0 before the first."""
+        return self.successes / self.interactions if self.interactions else 0.0
+
+
+class CollectionProgress:
+    """Shows how far a collection is; use as a context and call with each receipt."""
+
+    def __init__(self, title: str, done: int, total: int, leaves: str, clock: Callable[[], float] = time.monotonic):
+        """Say what is there and what is left.
+
+        Args:
+            title: of the plan.
+            done: rollouts that are committed already.
+            total: rollouts wanted in all.
+            leaves: what will be there in the end, such as the store's path.
+            clock: monotonic seconds.
+        """
+        self.tally = Tally()
+        self._console = Console(file=sys.stderr, highlight=False)
+        self._title, self._done, self._total, self._leaves, self._clock = title, done, total, leaves, clock
+        self._begun = self._last_line = clock()
+        self._bar: Progress | None = None
+
+    def __enter__(self) -> "CollectionProgress":
+        left = self._total - self._done
+        self._say(f"{self._title}: {self._done} of {self._total} rollouts are there, {left} left; into {self._leaves}")
+        self._begun = self._last_line = self._clock()
+        if self._console.is_terminal and left > 0:
+            columns: list[ProgressColumn] = [SpinnerColumn(), TextColumn("{task.description}"), BarColumn()]
+            self._bar = Progress(*columns, _Rates(self), console=self._console, transient=True)
+            self._bar.add_task(self._title, total=self._total, completed=self._done)
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+        if self.tally.rollouts:
+            self._say(f"{self._title}: {self.describe()}")
+
+    def __call__(self, receipt: "Receipt") -> None:
+        """Take in one receipt."""
+        self.tally.add(receipt)
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=self._done + self.tally.rollouts)
+        elif self._clock() - self._last_line >= LINE_EVERY_S:
+            self._last_line = self._clock()
+            self._say(f"{self._title}: {self.describe()}")
+
+    @property
+    def elapsed_s(self) -> float:
+        """Since work began in this attempt."""
+        return max(self._clock() - self._begun, 1e-9)
+
+    def describe(self) -> str:
+        """Done and left, speed, success rate and time left, in one line."""
+        done = self._done + self.tally.rollouts
+        rate = self.tally.interactions / self.elapsed_s
+        text = f"{done}/{self._total} rollouts, {rate:.0f} interactions/s, {self.tally.success_rate:.1%} successful"
+        if self.tally.rollouts > 0 and done < self._total:
+            left_s = (self._total - done) * self.elapsed_s / self.tally.rollouts
+            text += f", {_minutes(left_s)} left"
+        return text
+
+    def _say(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True, markup=False)
+
+
+class _Rates(ProgressColumn):
+    """The changing part of the live bar."""
+
+    def __init__(self, progress: CollectionProgress) -> None:
+        super().__init__()
+        self._progress = progress
+
+    def render(self, task: "Task") -> Text:
+        """See `rich.progress.ProgressColumn`."""
+        return Text(self._progress.describe())
+
+
+def _minutes(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    return f"{minutes}:{rest:02d} min"
