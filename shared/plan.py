@@ -53,6 +53,12 @@ class Plan(StrictModel):
         """Name of the plan within its store, such as "random-v0"."""
         return f"{self.proposer}-v{self.policy_version}"
 
+    @property
+    def most_tries(self) -> int:
+        """How many interactions a policy may propose in one rollout."""
+        evaluation = self.setting.evaluation
+        return max(evaluation.budgets) if evaluation is not None else self.setting.collection.rollout.context
+
 
 @dataclass(frozen=True, slots=True)
 class Job:

@@ -199,8 +199,10 @@ class Environment(Protocol):
 class Proposer(Protocol):
     """Anything that chooses what to try next."""
 
-    name: str
-    """What rows call it: "random", "aip", ..."""
+    @property
+    def name(self) -> str:
+        """What rows call it: "random", "aip", ..."""
+        ...
 
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
         """The next action, or None to stop."""

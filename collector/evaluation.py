@@ -1,0 +1,105 @@
+"""Evaluation rollouts: the paper's test-time procedure, for every method on the same object and hidden dynamics.
+
+Every method starts from the same state. Its tries continue one another; after each budget the action that its adapted
+affordance chooses is executed from where the tries left the object (as in the paper), and undone.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from collector.clock import StageClock
+from collector.proposers import RandomProposer
+from collector.recorder import Recorder, try_from_one_state, try_repeatedly
+from shared import seeds
+from shared.errors import UsageError
+from shared.plan import Plan
+from shared.vocabulary import Interaction, Order, Proposer, Role
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """Who fills the set of interactions, and who chooses the action that is judged."""
+
+    tries: str | None
+    exploits: str
+
+
+METHODS = {
+    "where2act": Method(None, "where2act"),
+    "ours-random": Method("random", "aap"),
+    "ours-final": Method("aip", "aap"),
+}
+
+
+def method_named(name: str) -> Method:
+    """The method called `name`.
+
+    Raises:
+        UsageError: there is no such method; the message lists those there are.
+    """
+    if name not in METHODS:
+        raise UsageError(f"unknown method '{name}'; allowed: {', '.join(METHODS)}")
+    return METHODS[name]
+
+
+def evaluate(
+    plan: Plan,
+    index: int,
+    recorder: Recorder,
+    make_proposer: Callable[[str, np.random.Generator], Proposer],
+    clock: StageClock,
+) -> None:
+    """Run every method of the plan on the environment's present state.
+
+    Args:
+        plan: an evaluation plan.
+        index: number of the rollout.
+        recorder: of the environment, in its start state.
+        make_proposer: makes "aip", "aap" and "where2act".
+        clock: sums wall time by stage.
+    """
+    config = plan.setting.evaluation
+    assert config is not None, "an evaluation setting says what to evaluate"
+
+    def rng(purpose: str) -> np.random.Generator:
+        return seeds.generator(plan.setting.seed, f"{purpose}/{plan.key}", index)
+
+    environment = recorder.environment
+    start = environment.state()
+    try_from_one_state(recorder, RandomProposer(rng("queries")), config.queries, Role.QUERY)
+    for name in config.methods:
+        environment.restore(start)
+        method = method_named(name)
+        exploiter = make_proposer(method.exploits, rng(f"exploit/{name}"))
+        context: Proposer | None = None
+        if method.tries == RandomProposer.name:
+            context = RandomProposer(rng(f"context/{name}"))
+        elif method.tries is not None:
+            context = make_proposer(method.tries, rng(f"context/{name}"))
+        _adapt(recorder, name, context, exploiter, sorted(config.budgets), clock)
+    environment.restore(start)
+
+
+def _adapt(
+    recorder: Recorder,
+    method: str,
+    context: Proposer | None,
+    exploiter: Proposer,
+    budgets: list[int],
+    clock: StageClock,
+) -> None:
+    """Fill the set of interactions one try at a time; at each budget, execute what the method would do, and undo it."""
+    environment, history = recorder.environment, list[Interaction]()
+    for budget in budgets:
+        if context is not None:  # A proposer that has seen enough leaves the greater budgets with what there is.
+            try_repeatedly(recorder, context, budget, Role.CONTEXT, history, method, clock)
+        observation = environment.observe()
+        if not observation.movable.any():
+            return
+        state = environment.state()
+        action = exploiter.propose(observation, history)
+        assert action is not None, "an exploiter never stops"
+        recorder.try_action(action, exploiter.name, Order.RESTART, Role.EXPLOIT, method, budget)
+        environment.restore(state)

@@ -1,0 +1,188 @@
+"""The six gripper primitives: trajectories, the first-contact rule and the success rule (published protocol).
+
+Every primitive is a pure translation of the hand from p - 0.15 d, where d is the approach direction.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from collector.gripper import FINGER_OPEN
+from collector.scene import Scene
+from shared.configuration import Fidelity
+from shared.vocabulary import Action, Float, Outcome, OutcomeKind, Primitive
+
+START_DISTANCE = 0.15
+"""From the hand frame's origin to p at the start, along the approach."""
+REACH_DISTANCE = {Primitive.PUSH_LEFT: 0.11, Primitive.PUSH_UP: 0.11}
+"""Likewise after the approach; 0.10 where not named."""
+SLIDE = 0.05
+"""How far the second leg of the sideways primitives goes."""
+GRASP_OPENING = 0.01
+"""Fingers that together stay open by no more than this hold nothing."""
+MOTION_THRESHOLD = 0.01
+"""tau: rad or length."""
+MOTION_SHARE = 0.5
+"""Or this share of the joint's range, for joints whose range is small."""
+DIRECTION_COSINE = 0.5
+"""The touched point must move within 60 deg of where the primitive means to take it."""
+SANE_POSITION = 1e3
+"""A joint position beyond this means that the simulation diverged."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Hand displacements from its start, in the hand frame, at the end of each leg.
+
+    Attributes:
+        approach: [3], where the first leg ends.
+        then: [3], where the second leg ends, or None.
+        intended: [3], direction in which the touched point should move, or None for any.
+    """
+
+    approach: Float
+    then: Float | None
+    intended: Float | None
+
+
+def trajectory(primitive: Primitive) -> Trajectory:
+    """The published trajectory of a primitive; hand frame: forward, left, up."""
+    approach = np.array([0.0, 0.0, START_DISTANCE - REACH_DISTANCE.get(primitive, 0.10)])
+    if primitive is Primitive.PUSH:
+        return Trajectory(approach, None, None)
+    if primitive is Primitive.PULL:
+        return Trajectory(approach, np.zeros(3), np.array([0.0, 0.0, -1.0]))
+    sideways = np.array([1.0, 0.0, 0.0] if primitive.value.endswith("left") else [0.0, 1.0, 0.0])
+    return Trajectory(approach, approach + SLIDE * sideways, sideways)
+
+
+def hand_start(action: Action) -> Float:
+    """Where the hand frame's origin starts, [3], world."""
+    return action.point - START_DISTANCE * action.approach
+
+
+class _TrialEndedError(Exception):
+    """A trial is over before its trajectory is; never leaves this module."""
+
+    def __init__(self, kind: OutcomeKind) -> None:
+        super().__init__(kind)
+        self.kind = kind
+
+
+class Trial:
+    """One execution of a primitive in a scene.
+
+    Args:
+        scene: with the object in its start state.
+        action: p and R.
+        target: the part (1-based) that p lies on.
+        primitive: what to execute.
+        fidelity: how finely.
+    """
+
+    def __init__(self, scene: Scene, action: Action, target: int, primitive: Primitive, fidelity: Fidelity) -> None:
+        self.scene = scene
+        self.action = action
+        self.target = target
+        self.primitive = primitive
+        self.fidelity = fidelity
+        self.steps = 0
+        self._touched = False
+        self._hand_at = np.zeros(3)
+        self._opening = float("nan")
+
+    def run(self) -> Outcome:
+        """Execute the primitive and judge it; the scene is left as the trial leaves it, the hand parked."""
+        scene = self.scene
+        start = scene.joint_positions()[self.target - 1]
+        body_from_world = np.linalg.inv(scene.body_pose(self.target))
+        local = body_from_world @ np.append(self.action.point, 1.0)
+        scene.gripper.place(self.action.rotation, hand_start(self.action), FINGER_OPEN * self.primitive.pulls)
+        try:
+            self._execute()
+            kind = OutcomeKind.OK if self._touched else OutcomeKind.NO_CONTACT
+        except _TrialEndedError as ended:
+            kind = ended.kind
+        end = scene.joint_positions()[self.target - 1]
+        displacement = (scene.body_pose(self.target) @ local)[:3] - self.action.point
+        scene.park()
+        if not np.isfinite(scene.joint_positions()).all() or np.abs(scene.joint_positions()).max() > SANE_POSITION:
+            return Outcome(OutcomeKind.UNSTABLE, 0.0, False, float(start), steps=self.steps)
+        valid = kind in (OutcomeKind.OK, OutcomeKind.NO_CONTACT)
+        return Outcome(
+            kind=kind,
+            motion=float(abs(end - start)) if valid else 0.0,
+            success=valid and self._succeeded(start, end, displacement),
+            start_joint_position=float(start),
+            end_joint_position=float(end),
+            displacement=displacement,
+            grasp_opening=self._opening,
+            steps=self.steps,
+        )
+
+    def _execute(self) -> None:
+        path, gripper, fidelity = trajectory(self.primitive), self.scene.gripper, self.fidelity
+        self._leg(path.approach)
+        self._hold()
+        if self.primitive.pulls:
+            gripper.drive_fingers(0.0)
+            self._hold()
+            self._opening = gripper.opening()
+            if self._opening <= GRASP_OPENING:
+                raise _TrialEndedError(OutcomeKind.NO_GRASP)
+        if path.then is not None:
+            self._leg(path.then)
+            self._hold()
+        assert self.steps <= 2 * fidelity.leg_steps + 3 * fidelity.hold_steps
+
+    def _leg(self, end: Float) -> None:
+        """Drive the hand along a straight line to `end`, [3], hand frame, at constant speed."""
+        start, steps = self._hand_at, self.fidelity.leg_steps
+        velocity = (end - start) * (self.fidelity.steps_per_second / steps)
+        moving = [k for k in range(3) if velocity[k] != 0.0]
+        joints = self.scene.gripper.joints
+        for k in moving:
+            joints[k].set_drive_velocity_target(velocity[k])
+        for step in range(1, steps + 1):
+            for k in moving:
+                joints[k].set_drive_target(start[k] + (end[k] - start[k]) * (step / steps))
+            self._step()
+        for k in moving:
+            joints[k].set_drive_velocity_target(0.0)
+        self._hand_at = end
+
+    def _hold(self) -> None:
+        """Keep all drive targets for a while."""
+        for _ in range(self.fidelity.hold_steps):
+            self._step()
+
+    def _step(self) -> None:
+        self.scene.system.step()
+        self.steps += 1
+        if not self._touched:
+            self._check_first_contact()
+
+    def _check_first_contact(self) -> None:
+        """The published first-contact rule; checking ends with the first valid contact."""
+        contact = self.scene.contact()
+        if not contact.any:
+            return
+        if self.steps == 1:
+            raise _TrialEndedError(OutcomeKind.START_COLLISION)
+        if not self.primitive.pulls:
+            if contact.palm:
+                raise _TrialEndedError(OutcomeKind.HAND_CONTACT)
+            if contact.finger_on - {self.target}:
+                raise _TrialEndedError(OutcomeKind.WRONG_PART)
+        self._touched = True
+
+    def _succeeded(self, start: float, end: float, displacement: Float) -> bool:
+        low, high = self.scene.limits[self.target - 1]
+        motion = abs(end - start)
+        if not (motion > MOTION_THRESHOLD or motion > MOTION_SHARE * (high - low)):
+            return False
+        intended = trajectory(self.primitive).intended
+        if intended is None:
+            return True
+        length = float(np.linalg.norm(displacement))
+        return length > 0 and float(displacement @ (self.action.rotation @ intended)) > DIRECTION_COSINE * length

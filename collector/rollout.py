@@ -1,0 +1,121 @@
+"""Rollouts: one object, one draw of hidden dynamics, one camera, and a sequence of interactions."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from collector.articulation import ArticulatedObject
+from collector.clock import StageClock
+from collector.draws import Draw, draw_rollout
+from collector.environment import SapienEnvironment
+from collector.evaluation import evaluate
+from collector.proposers import RandomProposer
+from collector.recorder import Recorder, try_from_one_state, try_repeatedly
+from shared import seeds
+from shared.geometry import camera_pose
+from shared.plan import Plan
+from shared.records import RolloutRecord
+from shared.tasks import task_named
+from shared.vocabulary import Order, Proposer, Role
+
+TRIES = 8
+"""Draws of a camera and a state before a rollout is given up as showing nothing that could be acted upon."""
+
+ProposerFactory = Callable[[str, np.random.Generator], Proposer]
+"""Makes the proposer of a name, such as "aip", with its own randomness."""
+
+
+def run_rollout(
+    plan: Plan, index: int, target: ArticulatedObject, make_proposer: ProposerFactory, clock: StageClock
+) -> RolloutRecord:
+    """Execute one rollout of a plan.
+
+    Args:
+        plan: what is collected.
+        index: which of its rollouts.
+        target: the object that `collector.draws.object_of` names.
+        make_proposer: makes the proposers that the plan needs.
+        clock: sums wall time by stage.
+    """
+    for attempt in range(TRIES):
+        draw = draw_rollout(plan, index, attempt)
+        environment = make_environment(plan, draw, target, clock, attempt)
+        states = seeds.generator(plan.setting.seed, f"states/{plan.key}", index, attempt)
+        if not (environment.reset(states) and environment.shows_a_target()):
+            continue
+        recorder = Recorder(environment, plan.policy_version)
+        if plan.setting.kind == "evaluation":
+            evaluate(plan, index, recorder, make_proposer, clock)
+        else:
+            collect(plan, index, recorder, states, make_proposer, clock)
+        return _record(plan, draw, "ok", recorder)
+    return _record(plan, draw, "nothing-to-act-on", None)
+
+
+def make_environment(
+    plan: Plan, draw: Draw, target: ArticulatedObject, clock: StageClock, attempt: int = 0
+) -> SapienEnvironment:
+    """The simulated environment of one rollout."""
+    setting, task = plan.setting, task_named(plan.setting.task)
+    camera = setting.collection.camera
+    return SapienEnvironment(
+        target,
+        task,
+        setting.collection.primitive or task.primitive,
+        draw.dynamics,
+        camera_pose(draw.azimuth_deg, draw.elevation_deg, camera.distance),
+        camera,
+        setting.collection.fidelity,
+        seeds.generator(setting.seed, f"pixels/{plan.key}", draw.index, attempt),
+        clock,
+    )
+
+
+def collect(
+    plan: Plan,
+    index: int,
+    recorder: Recorder,
+    states: np.random.Generator,
+    make_proposer: ProposerFactory,
+    clock: StageClock,
+) -> None:
+    """Training data: what a policy proposes comes first, each try continuing the last; random tries fill the rest."""
+    rollout = plan.setting.collection.rollout
+    random = RandomProposer(seeds.generator(plan.setting.seed, f"actions/{plan.key}", index))
+    environment = recorder.environment
+    if plan.proposer != RandomProposer.name:
+        first = environment.state()
+        rng = seeds.generator(plan.setting.seed, f"policy/{plan.key}", index)
+        most = min(rollout.context, rollout.interactions)
+        try_repeatedly(recorder, make_proposer(plan.proposer, rng), most, Role.COLLECT, [], "", clock)
+        environment.restore(first)
+    elif rollout.order is Order.CONTINUE:
+        try_repeatedly(recorder, random, rollout.interactions, Role.COLLECT, [], "", clock)
+    while (left := rollout.interactions - len(recorder.interactions)) > 0:
+        one_state = environment.task.closed  # Every draw of a state would give the same one.
+        before = len(recorder.interactions)
+        try_from_one_state(recorder, random, left if one_state else min(left, rollout.actions_per_state), Role.COLLECT)
+        if one_state or not _next_state(environment, states):
+            break
+        assert len(recorder.interactions) > before, "a state without targets is never used"
+
+
+def _next_state(environment: SapienEnvironment, states: np.random.Generator) -> bool:
+    """Draw states until one is at rest and shows a target; whether one was found."""
+    return any(environment.reset(states) and environment.shows_a_target() for _ in range(TRIES))
+
+
+def _record(plan: Plan, draw: Draw, status: str, recorder: Recorder | None) -> RolloutRecord:
+    return RolloutRecord(
+        index=draw.index,
+        plan_key=plan.key,
+        object=draw.object,
+        dynamics=draw.dynamics,
+        azimuth_deg=draw.azimuth_deg,
+        elevation_deg=draw.elevation_deg,
+        seed=plan.setting.seed,
+        fidelity=plan.setting.collection.fidelity.name,
+        status=status,
+        observations=tuple(recorder.observations) if recorder else (),
+        interactions=tuple(recorder.interactions) if recorder else (),
+    )
