@@ -5,7 +5,9 @@ plan = Plan(setting=setting)
 rollout = fabricate_rollout(plan, index=5, interactions=32)
 """
 
+import dataclasses
 import hashlib
+import struct
 
 import numpy as np
 
@@ -143,3 +145,19 @@ def fabricate_interaction(
         hand_start=rng.normal(size=7),
         seconds=rng.uniform(0.01, 0.04),
     )
+
+
+def identical(one: object, other: object) -> bool:
+    """Whether two records are the same bit for bit: signs of zero, NaNs, types and shapes included."""
+    if type(one) is not type(other):
+        return False
+    if dataclasses.is_dataclass(one):
+        names = [field.name for field in dataclasses.fields(one)]
+        return all(identical(getattr(one, name), getattr(other, name)) for name in names)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(identical, one, other))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+    if isinstance(one, float):
+        return struct.pack("<d", one) == struct.pack("<d", other)
+    return one == other

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from shared.store.layout import MANIFEST_FILE, ShardManifest
 from shared.store.store import Store
 from shared.vocabulary import OutcomeKind
 
@@ -66,10 +67,14 @@ def info(store: Store) -> StoreInfo:
         rollouts=sum(manifest.rollouts for manifest in manifests),
         interactions=len(labels),
         observations=sum(manifest.observations for manifest in manifests),
-        bytes=sum(manifest.bytes for manifest in manifests),
+        bytes=sum(manifest.bytes + _manifest_bytes(store, manifest) for manifest in manifests),
         by_category=tally(table["object_category"]),
         by_proposer=tally(proposers),
         by_role=tally(table["role"]),
         by_outcome=dict(sorted(Counter(table["outcome"]).items())),
         by_status=dict(sorted(Counter(store.rollouts().column("status").to_pylist()).items())),
     )
+
+
+def _manifest_bytes(store: Store, manifest: ShardManifest) -> int:
+    return (store.shards_folder / manifest.shard_id / MANIFEST_FILE).stat().st_size

@@ -23,6 +23,7 @@ from shared.store import policies, reader
 from shared.store.difference import difference_of
 from shared.store.digest import combined_digest
 from shared.store.layout import (
+    LOCK_PREFIX,
     MAX_DOCUMENT_BYTES,
     PLANS_FOLDER,
     POLICIES_FOLDER,
@@ -279,7 +280,7 @@ def _refuse_foreign(path: Path) -> None:
     """Refuse a folder that holds anything but what another process, creating at this moment, may have put there."""
     for entry in path.iterdir():
         # The other process may have finished since, and its first shard may be there.
-        if not entry.name.startswith(TEMPORARY_PREFIX) and not (path / STORE_FILE).exists():
+        if not entry.name.startswith((TEMPORARY_PREFIX, LOCK_PREFIX)) and not (path / STORE_FILE).exists():
             raise StoreError(f"{path}: is not empty and no store (it holds {entry.name!r}); name an empty folder")
 
 

@@ -1,0 +1,149 @@
+"""Laws of the file layer: whole or not at all, bounded, and never taken from a live process."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared import files
+from shared.errors import StoreError, UsageError
+from shared.observation import pack_normals, round_normals, round_points, unpack_normals
+
+
+def test_writing_replaces_the_whole_content_and_leaves_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    files.write_atomically(path, b"long old content")
+    files.write_atomically(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failed_write_leaves_the_old_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.json"
+    files.write_atomically(path, b"old")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        files.write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_only_the_first_creator_wins(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    assert files.create_exclusively(path, b"first")
+    assert not files.create_exclusively(path, b"second")
+    assert path.read_bytes() == b"first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_durable_writing_never_replaces(tmp_path: Path) -> None:
+    files.write_durably(tmp_path / "a", b"1")
+    with pytest.raises(FileExistsError):
+        files.write_durably(tmp_path / "a", b"2")
+
+
+@given(data=st.binary(max_size=64), limit=st.integers(0, 64))
+def test_reading_is_bounded(tmp_path_factory: pytest.TempPathFactory, data: bytes, limit: int) -> None:
+    path = tmp_path_factory.getbasetemp() / "bounded"
+    path.write_bytes(data)
+    if len(data) <= limit:
+        assert files.read_bounded(path, limit) == data
+    else:
+        with pytest.raises(StoreError, match="larger"):
+            files.read_bounded(path, limit)
+
+
+def test_reading_refuses_what_is_no_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"secret")
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("link", "pipe", "missing", "."):
+        with pytest.raises(StoreError) as caught:
+            files.read_bounded(tmp_path / name, 100)
+        assert "\n" not in str(caught.value)
+
+
+def test_sha256_of_a_known_file(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    assert files.sha256_of(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_a_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    code = "import sys, time, pathlib; from shared.files import exclusive_lock\n"
+    code += f"with exclusive_lock(pathlib.Path({str(path)!r})): print('held', flush=True); time.sleep(60)"
+    holder = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert holder.stdout is not None
+    try:
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(UsageError, match=rf"in use by process {holder.pid}"), files.exclusive_lock(path):
+            pass
+    finally:
+        holder.send_signal(signal.SIGKILL)
+        holder.wait()
+        holder.stdout.close()
+    with files.exclusive_lock(path):
+        assert path.read_text().startswith(f"{os.getpid()} on ")
+    with files.exclusive_lock(path):
+        pass
+
+
+def test_a_lock_waits_as_long_as_it_is_told(tmp_path: Path) -> None:
+    with files.exclusive_lock(tmp_path / "lock"):
+        start = time.monotonic()
+        with pytest.raises(UsageError), files.exclusive_lock(tmp_path / "lock", wait_seconds=0.05):
+            pass
+        assert time.monotonic() - start >= 0.05
+
+
+def test_only_what_the_dead_left_is_removed(tmp_path: Path) -> None:
+    code = f"from shared.files import temporary_name; import pathlib; (pathlib.Path({str(tmp_path)!r})"
+    code += " / temporary_name('shard')).mkdir()"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    left = next(tmp_path.iterdir())
+    (left / "file").write_bytes(b"x")
+    ours = tmp_path / files.temporary_name("shard")
+    ours.write_bytes(b"x")
+    other = tmp_path / ".tmp-of-something-else"
+    other.write_bytes(b"x")
+    # The number of a live process, but another start time: a stranger that was given a dead writer's number.
+    reused = tmp_path / left.name.replace(left.name.split("~")[2], str(os.getpid()))
+    reused.mkdir()
+    assert [files.remove_if_abandoned(path) for path in (left, ours, other, reused)] == [True, False, False, True]
+    assert sorted(tmp_path.iterdir()) == sorted([ours, other])
+
+
+def test_removing_a_link_leaves_what_it_points_at(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "file").write_bytes(b"x")
+    (tmp_path / "link").symlink_to(tmp_path / "folder")
+    files.remove_tree(tmp_path / "link")
+    assert (tmp_path / "folder" / "file").exists()
+    assert not (tmp_path / "link").exists()
+
+
+@given(st.lists(st.floats(-60000, 60000, width=32), min_size=3, max_size=30))
+def test_rounding_points_twice_changes_nothing(values: list[float]) -> None:
+    points = round_points(np.array(values))
+    assert points.dtype == np.float32
+    assert np.array_equal(round_points(points), points)
+    assert np.abs(points - np.array(values)).max() <= np.abs(values).max() * 2**-11 + 2**-24
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=30))
+def test_rounding_normals_twice_changes_nothing(values: list[float]) -> None:
+    normals = round_normals(np.array(values))
+    assert normals.dtype == np.float32
+    assert np.array_equal(unpack_normals(pack_normals(normals)), normals)
+    assert np.abs(normals - np.array(values)).max() <= 0.5 / 127 + 1e-6
