@@ -22,7 +22,7 @@ from pathlib import Path
 from shared.errors import StoreError, UsageError
 
 TEMPORARY_PREFIX = ".tmp-"
-_TEMPORARY_NAME = re.compile(r"^\.tmp-[^~]*~(?P<space>[^~]*)~(?P<pid>\d{1,10})~(?P<start>\d{1,20})~[0-9a-f]+$")
+_TEMPORARY_NAME = re.compile(r"\.tmp-[^~]*~(?P<space>[^~]*)~(?P<pid>\d{1,10})~(?P<start>\d{1,20})~[0-9a-f]+")
 _LOCK_POLL_S = 0.01
 
 
@@ -179,7 +179,7 @@ def remove_if_abandoned(path: Path) -> bool:
     Returns:
         Whether it was removed.
     """
-    match = _TEMPORARY_NAME.match(path.name)
+    match = _TEMPORARY_NAME.fullmatch(path.name)
     if match is None or match["space"] != _process_space() or _is_running(int(match["pid"]), int(match["start"])):
         return False
     remove_tree(path)

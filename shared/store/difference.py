@@ -15,7 +15,7 @@ def difference_of(stored: dict[str, Any], given: dict[str, Any]) -> str:
 
 def _walk(stored: Any, given: Any, name: str) -> Iterator[str]:
     if isinstance(stored, dict) and isinstance(given, dict):
-        for key in sorted(stored.keys() | given.keys()):
+        for key in dict.fromkeys([*stored, *given]):
             yield from _walk(stored.get(key), given.get(key), f"{name}.{key}" if name else key)
     elif isinstance(stored, list) and isinstance(given, list) and len(stored) != len(given):
         yield f"{name}: the store has {len(stored)} entries, given {len(given)}"

@@ -36,15 +36,15 @@ LOCK_PREFIX = ".lock-"
 
 MAX_DOCUMENT_BYTES = 64 << 20
 """No document of a store is larger; a million objects in a setting would be."""
-MAX_ROLLOUTS = 1 << 16
-MAX_INTERACTIONS = 1 << 20
-MAX_OBSERVATIONS = 1 << 16
+MAX_ROWS = 1 << 16
 MAX_POINTS = 1 << 14
-"""Bounds of one shard, so that a hostile manifest cannot ask for unbounded work."""
+MAX_ALL_POINTS = 1 << 25
+"""Bounds of one shard: rollouts, interactions and observations; N; and points of all clouds. A hostile manifest
+cannot ask for unbounded work."""
 
 _SHA256 = r"^[0-9a-f]{64}$"
 PLAN_KEY = r"[a-z][a-z0-9-]{0,30}-v[0-9]{1,9}"
-_SHARD_ID = re.compile(rf"^(?P<plan>{PLAN_KEY})-(?P<start>\d{{8,12}})-(?P<stop>\d{{8,12}})$")
+_SHARD_ID = re.compile(rf"(?P<plan>{PLAN_KEY})-(?P<start>[0-9]{{8,12}})-(?P<stop>[0-9]{{8,12}})")
 
 
 class FileEntry(StrictModel):
@@ -61,13 +61,13 @@ class ShardManifest(StrictModel):
     plan_key: str = Field(pattern=rf"^{PLAN_KEY}$")
     start: int = Field(ge=0)
     stop: int = Field(ge=1)
-    interactions: int = Field(ge=0, le=MAX_INTERACTIONS)
-    observations: int = Field(ge=0, le=MAX_OBSERVATIONS)
+    interactions: int = Field(ge=0, le=MAX_ROWS)
+    observations: int = Field(ge=0, le=MAX_ROWS)
     points: int = Field(ge=1, le=MAX_POINTS)
     """N, of every cloud."""
     files: dict[str, FileEntry]
     """By path within the shard; all but the manifest itself."""
-    digests: tuple[str, ...] = Field(max_length=MAX_ROLLOUTS)
+    digests: tuple[str, ...] = Field(max_length=MAX_ROWS)
     """Content digest of each rollout, from `start` on."""
     software: dict[str, str]
     provenance: dict[str, str]
@@ -76,8 +76,10 @@ class ShardManifest(StrictModel):
     def _consistent(self) -> "ShardManifest":
         if self.stop - self.start != len(self.digests) or not self.digests:
             raise ValueError(f"rollouts {self.start} to {self.stop} need as many digests, not {len(self.digests)}")
-        if not all(re.match(_SHA256, digest) for digest in self.digests):
+        if not all(re.fullmatch(_SHA256, digest) for digest in self.digests):
             raise ValueError("a digest is not a SHA-256")
+        if self.observations * self.points > MAX_ALL_POINTS:
+            raise ValueError(f"{self.observations} clouds of {self.points} points; allowed: {MAX_ALL_POINTS} points")
         return self
 
     @property
@@ -148,7 +150,7 @@ def check_schema_version(content: dict[str, Any], source: str) -> None:
 
 def parse_shard_id(name: str) -> Job | None:
     """The job whose shard would be called `name`; None if no shard is called that."""
-    match = _SHARD_ID.match(name)
+    match = _SHARD_ID.fullmatch(name)
     if match is None:
         return None
     job = Job(match["plan"], int(match["start"]), int(match["stop"]))

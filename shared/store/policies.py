@@ -16,7 +16,7 @@ from shared.store.sealed import parse_object, seal, unseal
 INDEX_FILE = "index.json"
 MAX_POLICY_BYTES = 1 << 30
 MAX_VERSION = 999_999
-_FILE_NAME = re.compile(r"^[a-z0-9][a-z0-9._-]{0,99}$")
+_FILE_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,99}")
 
 
 class PolicyIndex(StrictModel):
@@ -98,7 +98,7 @@ def folder_name(version: int) -> str:
 
 
 def _allowed(name: str) -> bool:
-    return _FILE_NAME.match(name) is not None and name != INDEX_FILE
+    return _FILE_NAME.fullmatch(name) is not None and name != INDEX_FILE
 
 
 def _read(path: Path, entry: FileEntry) -> bytes:

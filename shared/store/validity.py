@@ -8,6 +8,7 @@ import numpy as np
 from shared.errors import StoreError
 from shared.plan import Job
 from shared.records import InteractionRecord, RolloutRecord
+from shared.store.layout import MAX_ALL_POINTS, MAX_ROWS
 from shared.store.observations import check_observation
 from shared.vocabulary import Float
 
@@ -30,6 +31,12 @@ def check_rollouts(rollouts: Sequence[RolloutRecord], job: Job, points: int, sou
     """
     if [rollout.index for rollout in rollouts] != list(range(job.start, job.stop)):
         raise StoreError(f"{source}: needs rollouts {job.start} to {job.stop - 1}, each once and in order")
+    clouds = sum(len(rollout.observations) for rollout in rollouts)
+    tries = sum(len(rollout.interactions) for rollout in rollouts)
+    if clouds * points > MAX_ALL_POINTS or max(clouds, tries, len(rollouts)) > MAX_ROWS:
+        raise StoreError(
+            f"{source}: {clouds} clouds and {tries} interactions are too many for one shard; divide the job"
+        )
     for rollout in rollouts:
         try:
             if rollout.plan_key != job.plan_key:

@@ -94,7 +94,7 @@ def _describe(
         files={n: FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) for n, data in files.items()},
         digests=tuple(rollout_digest(rollout) for rollout in rollouts),
         software=software_versions(),
-        provenance=process_provenance() | dict(provenance),
+        provenance=process_provenance() | {name: str(value) for name, value in provenance.items()},
     )
 
 
