@@ -88,6 +88,7 @@ class Trial:
         self.fidelity = fidelity
         self.steps = 0
         self._touched = False
+        self._brushed = False
         self._hand_at = np.zeros(3)
         self._opening = float("nan")
 
@@ -100,7 +101,7 @@ class Trial:
         scene.gripper.place(self.action.rotation, hand_start(self.action), FINGER_OPEN * self.primitive.pulls)
         try:
             self._execute()
-            kind = OutcomeKind.OK if self._touched else OutcomeKind.NO_CONTACT
+            kind = OutcomeKind.OK if self._touched or self._brushed else OutcomeKind.NO_CONTACT
         except _TrialEndedError as ended:
             kind = ended.kind
         end = scene.joint_positions()[self.target - 1]
@@ -165,6 +166,7 @@ class Trial:
     def _check_first_contact(self) -> None:
         """The published first-contact rule; checking ends with the first valid contact."""
         contact = self.scene.contact()
+        self._brushed = self._brushed or contact.brushes
         if not contact.any:
             return
         if self.steps == 1:

@@ -15,7 +15,7 @@ from shared.configuration import Fidelity
 from shared.vocabulary import Direction, Float, HiddenDynamics
 
 RESTITUTION = 0.01
-FRICTION_DAMPING = 1e4
+FRICTION_DAMPING = 1e5
 """Damping of the force-limited drive that stands for Coulomb friction: below its limit a joint creeps by at most
 limit / damping a second."""
 CONTACT_FORCE = 5.0
@@ -30,16 +30,18 @@ class Contact:
     """What the hand touches at this moment, by forces that the published rule counts.
 
     Attributes:
-        finger_on: bodies (0 the root, k the k-th part) that a finger touches.
-        palm: whether the palm touches anything.
+        finger_on: bodies (0 the root, k the k-th part) that a finger presses on.
+        palm: whether the palm presses on anything.
+        brushes: whether the hand touches anything at all, however lightly.
     """
 
     finger_on: frozenset[int]
     palm: bool
+    brushes: bool
 
     @property
     def any(self) -> bool:
-        """Whether the hand touches anything at all."""
+        """Whether the hand presses on anything."""
         return self.palm or bool(self.finger_on)
 
 
@@ -137,17 +139,21 @@ class Scene:
 
     def contact(self) -> Contact:
         """What the hand touches after the last step."""
-        finger_on, palm = set(), False
+        finger_on, palm, brushes = set(), False, False
         for contact in self.system.get_contacts():
             first, second = contact.bodies
-            if (first in self._hand) == (second in self._hand) or not self._counts(contact):
+            if (first in self._hand) == (second in self._hand):
+                continue
+            strongest = max((float(p.impulse @ p.impulse) for p in contact.points), default=0.0)
+            brushes = brushes or strongest > 0.0
+            if strongest <= self._impulse_squared:
                 continue
             hand, other = (first, second) if first in self._hand else (second, first)
             if hand == self.gripper.palm:
                 palm = True
             else:
                 finger_on.add(self._bodies[other])
-        return Contact(frozenset(finger_on), palm)
+        return Contact(frozenset(finger_on), palm, brushes)
 
     def _presses(self) -> bool:
         """Whether anything presses on anything."""

@@ -80,7 +80,7 @@ class DynamicsRanges(StrictModel):
     """What hidden dynamics are drawn from (see `shared.vocabulary.HiddenDynamics` for units)."""
 
     part_mass: Range = Range(low=0.05, high=0.5, log=True)
-    joint_friction: Range = Range(low=0.02, high=2.0)
+    joint_friction: Range = Range(low=0.05, high=2.0, log=True)
     surface_friction: Range = Range(low=0.1, high=4.0, log=True)
 
 

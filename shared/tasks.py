@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from shared.configuration import DynamicsRanges, Range
+from shared.configuration import DynamicsRanges
 from shared.errors import UsageError
 from shared.vocabulary import Direction, Primitive
 
@@ -44,7 +44,6 @@ TASKS = {
             part_names=("door",),
             revolute_only=True,
             closed=True,
-            dynamics=DynamicsRanges(joint_friction=Range(low=0.02, high=1.0)),
         ),
         Task(
             "push-faucet",
