@@ -4,7 +4,9 @@ from pathlib import Path
 
 from pydantic import Field, field_validator, model_validator
 
+from learner.configuration import AapConfig, AipConfig, PriorConfig
 from shared.configuration import CollectionConfig, StrictModel
+from shared.networks.configuration import NetworkConfig
 from shared.plan import EvaluationConfig
 
 EXECUTION_SETTINGS = frozenset({"workers", "ray_address", "job_limit_s"})
@@ -50,6 +52,15 @@ class ProceduralConfig(StrictModel):
     """Objects of each category that the task applies to."""
 
 
+class LearnerSettings(StrictModel):
+    """What the learner is told, apart from the seed, which is the campaign's."""
+
+    network: NetworkConfig = NetworkConfig()
+    prior: PriorConfig = PriorConfig()
+    aap: AapConfig = AapConfig()
+    aip: AipConfig = AipConfig()
+
+
 class CampaignConfig(StrictModel):
     """One campaign: a random round, then alternating training and AIP rounds, then evaluation on unseen objects."""
 
@@ -65,6 +76,7 @@ class CampaignConfig(StrictModel):
     splits: SplitConfig = SplitConfig()
     procedural: ProceduralConfig = ProceduralConfig()
     collection: CollectionConfig = CollectionConfig()
+    learner: LearnerSettings = LearnerSettings()
     evaluation: EvaluationConfig = EvaluationConfig()
     workers: int = Field(2, ge=0, le=4096)
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""

@@ -89,7 +89,7 @@ class CollectionProgress:
         self.tally.add(receipt)
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=self._done + self.tally.rollouts)
-        elif self._clock() - self._last_line >= LINE_EVERY_S:
+        elif self._done + self.tally.rollouts < self._total and self._clock() - self._last_line >= LINE_EVERY_S:
             self._last_line = self._clock()
             self._say(f"{self._title}: {self.describe()}")
 

@@ -92,7 +92,7 @@ class RunFolder:
 
     def objects_used(self) -> ObjectsUsed:
         """What objects.json says."""
-        return parse(ObjectsUsed, _read_json(self.objects_file), str(self.objects_file))
+        return parse(ObjectsUsed, read_json(self.objects_file), str(self.objects_file))
 
 
 def begin(path: Path, config: CampaignConfig) -> RunFolder:
@@ -140,13 +140,18 @@ def _decisive(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read_config(run: RunFolder) -> dict[str, Any]:
-    config = _read_json(run.config).get("config")
+    config = read_json(run.config).get("config")
     if not isinstance(config, dict):
         raise UsageError(f"{run.config}: not the configuration of a run; name another folder")
     return config
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object of the run.
+
+    Raises:
+        StoreError: the file is missing, too large or damaged.
+    """
     try:
         document = json.loads(read_bounded(path, MAX_DOCUMENT_BYTES))
     except (ValueError, RecursionError):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from shared.errors import UsageError, WorkerError
 
+LEARNER_MODULE = "learner"
 THREADS = 2
 """Of torch, in a learner: the collectors rest while it trains."""
 PATIENCE_S = 10.0
@@ -28,7 +29,8 @@ def run_learner(arguments: Sequence[str], out: Path, say: Callable[[str], None])
         WorkerError: it failed otherwise; the message names output.txt.
     """
     out.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "cluster.lifeline", str(os.getpid()), sys.executable, "-m", "learner", *arguments]
+    wrapper = [sys.executable, "-m", "cluster.lifeline", str(os.getpid())]
+    command = [*wrapper, sys.executable, "-m", LEARNER_MODULE, *arguments]
     # A session of its own: Ctrl-C reaches this process alone, which then ends the learner in an orderly way.
     with (out / OUTPUT_FILE).open("w", encoding="utf-8") as log:
         child = subprocess.Popen(

@@ -1,0 +1,44 @@
+# Verbs of the house. Everything runs in .venv, which is made from constraints.txt on first need.
+
+PYTHON ?= python3
+VENV := .venv
+STAMP := $(VENV)/.stamp
+BIN := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help run test test-slow check format bench clean
+
+help:  ## List the verbs.
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/'
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 13) else f"needs Python 3.11 or 3.12, not {v[0]}.{v[1]}; try make PYTHON=python3.11")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	touch $@
+
+run: $(STAMP)  ## Collect, train, collect again, evaluate: a small campaign, a few minutes on two cores.
+	$(BIN)/adaafford run --preset smoke --out runs/smoke
+
+test: $(STAMP)  ## The tests, without the slow ones.
+	$(BIN)/python -m pytest -q -m "not slow"
+
+test-slow: $(STAMP)  ## The slow tests.
+	$(BIN)/python -m pytest -q -m slow
+
+check: $(STAMP)  ## Lint, formatting, types, import directions.
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
+
+format: $(STAMP)  ## Put the code in its form.
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: $(STAMP)  ## Run the benchmarks; results land in dated files.
+	@for script in benchmarks/*.py; do [ -e "$$script" ] || continue; echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+clean:  ## Remove the environment, caches and runs/.
+	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

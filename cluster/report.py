@@ -1,0 +1,136 @@
+"""The report of a run: summary.json for programs, a table for people, one picture."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from cluster.configuration import CampaignConfig
+from cluster.figures import collection_figures
+from cluster.ledger import Ledger
+from cluster.run_folder import RunFolder, read_json
+from shared.errors import UsageError
+from shared.files import write_atomically
+from shared.policy import Policy
+from shared.store import Store
+from shared.store.provenance import software_versions
+
+RESULTS_FILE = "results.json"
+"""What the learner's evaluation leaves: rows by method and budget."""
+
+
+def write_report(run: RunFolder, config: CampaignConfig) -> None:
+    """Write summary.json and affordance.png from what the run's stages left."""
+    ledger, store = Ledger(run.log), Store.open(run.store)
+    used = run.objects_used()
+    versions = store.policy_versions()
+    summary = {
+        "task": config.task,
+        "seed": config.seed,
+        "rows": _rows(run),
+        **collection_figures(store),
+        "interactions_per_core_second": _speed(ledger),
+        "policy_versions": [0, *versions],
+        "stage_seconds": {name: round(seconds, 1) for name, seconds in ledger.seconds.items()},
+        "wall_seconds": round(sum(ledger.seconds.values()), 1),
+        "workers": config.workers,
+        "objects": {
+            "folder": used.folder,
+            **{name: [ref.id for ref in getattr(used, name)] for name in ("train", "validation", "test")},
+            "refused": [{"id": object_id, "reason": reason} for object_id, reason in used.refused],
+        },
+        "store_digest": store.digest(),
+        "software": software_versions(),
+    }
+    write_atomically(run.summary, json.dumps(summary, indent=1, allow_nan=False).encode())
+    _draw(run, versions[-1])
+
+
+def print_report(run: RunFolder) -> None:
+    """Print the table of a run that was reported, and where its files are.
+
+    Raises:
+        UsageError: the run has no report yet.
+    """
+    if not run.summary.is_file():
+        raise UsageError(f"{run.path}: has no report yet; finish the run with `adaafford resume {run.path}`")
+    summary = read_json(run.summary)
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
+    console.print(_results_table(summary))
+    console.print(_rates_table(summary))
+    for line in _lines(summary, run):
+        console.print(line, markup=False, soft_wrap=True)
+
+
+def _rows(run: RunFolder) -> list[dict[str, Any]]:
+    rows = read_json(run.training("evaluate") / RESULTS_FILE)["rows"]
+    assert isinstance(rows, list)
+    return rows
+
+
+def _speed(ledger: Ledger) -> float | None:
+    """Stored interactions for each second that a worker worked, over the collection rounds."""
+    tallies = [ledger.result(name)["tally"] for name in ledger.finished if name.startswith("collect-")]
+    interactions = sum(tally["interactions"] for tally in tallies)
+    seconds = sum(tally["seconds"].get("total", 0.0) for tally in tallies)
+    return round(interactions / seconds, 2) if seconds > 0 else None
+
+
+def _draw(run: RunFolder, version: int) -> None:
+    """Draw the picture; matplotlib takes a second to import, so only here."""
+    from cluster.picture import draw_adaptation
+
+    policy = Policy.from_files(Store.open(run.store).read_policy(version))
+    draw_adaptation(Store.open(run.evaluation), policy, run.picture)
+
+
+def _results_table(summary: dict[str, Any]) -> Table:
+    table = Table(title=f"{summary['task']}: objects not seen in training")
+    names = ("method", "budget", "f_score", "sample_success", "trials", "best_f", "bce", "auc", "base_rate")
+    for name in names:
+        table.add_column(name.replace("_", " "), justify="left" if name == "method" else "right")
+    for row in summary["rows"]:
+        table.add_row(*(_cell(row.get(name)) for name in names))
+    return table
+
+
+def _rates_table(summary: dict[str, Any]) -> Table:
+    table = Table(title="random interactions, by category")
+    for name in ("category", "interactions", "successes", "success rate"):
+        table.add_column(name, justify="left" if name == "category" else "right")
+    for category, rate in summary["random_success_by_category"].items():
+        table.add_row(category, *(_cell(rate[name]) for name in ("interactions", "successes", "success_rate")))
+    return table
+
+
+def _lines(summary: dict[str, Any], run: RunFolder) -> list[str]:
+    objects = summary["objects"]
+    stages = ", ".join(f"{name} {seconds:g}" for name, seconds in summary["stage_seconds"].items())
+    motions = ", ".join(
+        f"{bin_['low']:g}+ {bin_['count']}" for bin_ in summary["random_motion_histogram"] if bin_["count"]
+    )
+    outcomes = ", ".join(f"{name} {each['share']:.1%}" for name, each in summary["outcomes"].items())
+    speed = summary["interactions_per_core_second"]
+    return [
+        f"objects       {len(objects['train'])} train, {len(objects['validation'])} validation, "
+        f"{len(objects['test'])} test, {len(objects['refused'])} refused (reasons in {run.objects_file.name})",
+        f"interactions  {summary['interactions']}, {'unknown' if speed is None else speed} a core-second; "
+        f"policy versions {', '.join(map(str, summary['policy_versions']))}",
+        f"outcomes      {outcomes}",
+        f"motions       {motions}",
+        f"seconds       {stages}; in all {summary['wall_seconds']:g}",
+        f"files         {_shown(run.summary)}  {_shown(run.picture)}  {_shown(run.store)}",
+    ]
+
+
+def _shown(path: Path) -> str:
+    return str(path) if path.exists() else f"(no {path.name})"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)

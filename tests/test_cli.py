@@ -1,0 +1,112 @@
+"""The command line: one clear line and code 2 for bad input, and instant help."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cluster.cli import COMMANDS, run
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *args: str) -> str:
+    """The one line that a refused command line prints."""
+    assert run(list(args)) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("adaafford: ")
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+    return err
+
+
+def test_help_imports_nothing_heavy() -> None:
+    script = (
+        "import sys; from cluster.cli import run; assert run(['--help']) == 0;"
+        "print(sorted({'torch', 'ray', 'sapien', 'zarr', 'matplotlib', 'tyro', 'numpy'} & sys.modules.keys()))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert all(name in done.stdout for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"version", "store", "objects"}))
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run([command, "--help"])
+    assert stop.value.code == 0
+    assert f"adaafford {command}" in capsys.readouterr().out
+
+
+def test_an_unknown_command_lists_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "allowed: run, resume" in complaint(capsys, "rum")
+
+
+def test_an_unknown_task_lists_those_there_are(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for command in (["run", "--out"], ["collect", "--store"]):
+        line = complaint(capsys, *command, str(tmp_path / "new"), "--task", "pusk")
+        assert "unknown task 'pusk'; allowed: push, pull" in line
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_missing_folder_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    gone = str(tmp_path / "gone")
+    assert gone in complaint(capsys, "objects", "check", gone)
+    assert gone in complaint(capsys, "store", "info", gone)
+    assert gone in complaint(capsys, "resume", gone)
+    assert gone in complaint(capsys, "report", gone)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[rollouts]\nrandum = 3\n", "unknown setting 'rollouts.randum'; did you mean 'random'?"),
+        ("[rollouts]\nrandom = 0\n", "setting 'rollouts.random'"),
+        ("[rollouts\n", "not valid TOML"),
+        ("[splits]\ntrain = 0.9\n", "must sum to 1"),
+    ],
+)
+def test_a_bad_configuration_file_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, text: str, expected: str
+) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    line = complaint(capsys, "run", "--config", str(file), "--out", str(tmp_path / "run"))
+    assert expected in line
+    assert str(file) in line
+
+
+def test_an_unknown_preset_lists_those_there_are(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    line = complaint(capsys, "run", "--preset", "huge", "--out", str(tmp_path / "run"))
+    assert "unknown preset 'huge'; allowed: laptop, smoke" in line
+
+
+@pytest.mark.parametrize("args", [["--rollouts", "x"], ["--rolouts", "3"], ["--rollouts", "0"]])
+def test_bad_flags_end_with_code_2(args: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        code = run(["collect", "--store", str(tmp_path / "store"), *args])
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    assert code == 2
+    assert "roll" in capsys.readouterr().err
+
+
+def test_aip_needs_a_policy(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert "--policy" in complaint(capsys, "collect", "--store", str(tmp_path), "--proposer", "aip")
+
+
+def test_a_folder_with_something_else_is_left_alone(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("")
+    assert "holds something that is no run" in complaint(capsys, "run", "--out", str(tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_store_of_another_schema_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "store.json").write_text(json.dumps({"schema_version": 999}))
+    assert "schema" in complaint(capsys, "store", "info", str(tmp_path))
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out.strip()[0].isdigit()

@@ -1,0 +1,77 @@
+"""Configuration: defaults under a preset under a file under flags; a run's folder keeps to one."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import tyro
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cluster.configuration import EXECUTION_SETTINGS, CampaignConfig, RolloutCounts
+from cluster.run_folder import begin, find
+from cluster.settings import difference, early_flags, layered, parse_flags, preset_names
+from shared.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    settings: Annotated[CampaignConfig, tyro.conf.arg(name="")]
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_is_valid(name: str) -> None:
+    assert layered(CampaignConfig, name, None).task
+
+
+def test_later_layers_win(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text("seed = 5\n[rollouts]\nrandom = 7\naip = 6\n")
+    from_file = layered(CampaignConfig, "smoke", file)
+    flags = ["--rollouts.random", "8", "--collection.camera.points", "512"]
+    chosen = parse_flags(Command, flags, "run", Command(from_file)).settings
+    assert (chosen.seed, chosen.rollouts.random, chosen.rollouts.aip) == (5, 8, 6)
+    assert chosen.rollouts.per_shard == layered(CampaignConfig, "smoke", None).rollouts.per_shard
+    assert chosen.collection.camera.points == 512
+
+
+def test_early_flags_are_found_among_others() -> None:
+    assert early_flags(["--x.y", "1", "--preset=smoke", "--out", "z"], "preset", "config") == {
+        "preset": "smoke",
+        "config": None,
+    }
+
+
+values = st.recursive(st.integers(0, 2), lambda inner: st.dictionaries(st.sampled_from("abc"), inner), max_leaves=6)
+
+
+@given(st.dictionaries(st.sampled_from("abc"), values), st.dictionaries(st.sampled_from("abc"), values))
+def test_a_difference_is_found_if_there_is_one(before: dict[str, object], after: dict[str, object]) -> None:
+    assert (difference(before, after) is None) == (before == after)
+
+
+def test_a_run_folder_remembers_its_configuration(tmp_path: Path) -> None:
+    config = CampaignConfig(seed=4, objects=tmp_path)
+    run = begin(tmp_path / "run", config)
+    assert find(run.path) == (run, config)
+    assert begin(tmp_path / "run", config) == run
+
+
+def test_another_configuration_is_refused(tmp_path: Path) -> None:
+    begin(tmp_path / "run", CampaignConfig(seed=4))
+    with pytest.raises(UsageError, match=r"holds another run \('rollouts.random' was 100, is now 7\)"):
+        begin(tmp_path / "run", CampaignConfig(seed=4, rollouts=RolloutCounts(random=7)))
+
+
+def test_how_many_workers_there_are_is_no_other_run(tmp_path: Path) -> None:
+    run = begin(tmp_path / "run", CampaignConfig(workers=2))
+    assert begin(tmp_path / "run", CampaignConfig(workers=0, job_limit_s=1.0)) == run
+    assert CampaignConfig.model_fields.keys() >= EXECUTION_SETTINGS
+
+
+def test_a_damaged_configuration_is_one_line(tmp_path: Path) -> None:
+    run = begin(tmp_path / "run", CampaignConfig())
+    run.config.write_text('{"config": {"sed": 1}}')
+    with pytest.raises(UsageError, match="unknown setting 'sed'; did you mean 'seed'"):
+        find(run.path)
