@@ -133,22 +133,9 @@ def _rollout_columns() -> tuple[Column[RolloutRow], ...]:
     )
 
 
-def _interaction_columns() -> tuple[Column[InteractionRow], ...]:
-    i = operator.attrgetter("interaction")
-    a = operator.attrgetter("interaction.action")
-    o = operator.attrgetter("interaction.outcome")
-    shared: tuple[str, ...] = (
-        "plan_key",
-        "rollout",
-        "object_id",
-        "object_category",
-        "object_hash",
-        "part_mass",
-        "joint_friction",
-    )
-    shared += ("surface_friction", "direction", "azimuth_deg", "elevation_deg", "seed", "fidelity")
+def _action_columns() -> tuple[Column[InteractionRow], ...]:
+    i, a = operator.attrgetter("interaction"), operator.attrgetter("interaction.action")
     return (
-        *(_of_rollout(column) for column in ROLLOUT_COLUMNS if column.name in shared),
         Column("step", "<i4", 0, "number within the rollout", lambda x: i(x).step),
         Column("rollout_observation", "<i4", 0, "index within the rollout", lambda x: i(x).observation),
         Column(
@@ -172,6 +159,12 @@ def _interaction_columns() -> tuple[Column[InteractionRow], ...]:
             content=False,
         ),
         Column("normal", "<f8", 3, "surface normal at p, world", lambda x: i(x).normal),
+    )
+
+
+def _choice_columns() -> tuple[Column[InteractionRow], ...]:
+    i = operator.attrgetter("interaction")
+    return (
         Column("primitive", "", 0, "gripper primitive", lambda x: i(x).primitive),
         Column("order", "", 0, "restart or continue", lambda x: i(x).order),
         Column("role", "", 0, "what the row is for", lambda x: i(x).role),
@@ -185,6 +178,12 @@ def _interaction_columns() -> tuple[Column[InteractionRow], ...]:
         Column("joint_positions", "<f8", LIST, "all joints at the start", lambda x: i(x).joint_positions),
         Column("joint_limits", "<f8", LIST, "lower, upper of each joint", lambda x: i(x).joint_limits.ravel()),
         Column("hand_start", "<f8", 7, "hand at the start, world, xyz wxyz", lambda x: i(x).hand_start),
+    )
+
+
+def _outcome_columns() -> tuple[Column[InteractionRow], ...]:
+    i, o = operator.attrgetter("interaction"), operator.attrgetter("interaction.outcome")
+    return (
         Column("outcome", "", 0, "how the trial ended", lambda x: o(x).kind),
         Column("motion", "<f8", 0, "m, rad or length", lambda x: o(x).motion),
         Column("success", "|b1", 0, "r", lambda x: o(x).success),
@@ -210,6 +209,12 @@ def _of_rollout(column: Column[RolloutRow]) -> Column[InteractionRow]:
 
 
 ROLLOUT_COLUMNS = _rollout_columns()
-INTERACTION_COLUMNS = _interaction_columns()
-COPIED_COLUMNS = tuple(c.name for c in INTERACTION_COLUMNS if c.name in {r.name for r in ROLLOUT_COLUMNS})
+_OF_SHARD_OR_EXTENT = ("status", "observations", "interactions", "first_observation")
+COPIED_COLUMNS = tuple(column.name for column in ROLLOUT_COLUMNS if column.name not in _OF_SHARD_OR_EXTENT)
 """Columns of interactions.parquet that repeat the row's rollout."""
+INTERACTION_COLUMNS = (
+    *(_of_rollout(column) for column in ROLLOUT_COLUMNS if column.name in COPIED_COLUMNS),
+    *_action_columns(),
+    *_choice_columns(),
+    *_outcome_columns(),
+)
