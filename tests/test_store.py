@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
+import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -320,6 +322,18 @@ def test_rows_find_their_clouds(tmp_path: Path) -> None:
     for row in table.to_pylist():
         cloud = clouds[row["shard"]].observation(row["observation"])
         assert np.array_equal(cloud.points[row["point_index"]], np.float32(row["point"]))
+
+
+def test_a_shard_opens_in_plain_zarr_and_parquet(tmp_path: Path) -> None:
+    store = make(tmp_path / "store", (0, 2))
+    shard = store.shards_folder / store.committed()[0].shard_id
+    rollouts = fabricate_rollouts(PLAN, Job(PLAN.key, 0, 2))
+    clouds = zarr.open_group(shard / "observations.zarr", mode="r")
+    points = clouds["points"][...]
+    assert points.dtype == np.float16
+    assert np.array_equal(points, [one.points for rollout in rollouts for one in rollout.observations])
+    motions = pq.read_table(shard / "interactions.parquet").column("motion").to_pylist()
+    assert motions == [one.outcome.motion for rollout in rollouts for one in rollout.interactions]
 
 
 def test_both_frames_say_the_same(tmp_path: Path) -> None:

@@ -141,7 +141,10 @@ def encode(observations: Sequence[Observation], points: int) -> dict[str, bytes]
         )
         if len(observations):
             array[...] = data
-    return {path: buffer.to_bytes() for path, buffer in memory.items()}
+    files = {path: buffer.to_bytes() for path, buffer in memory.items()}
+    # Zarr indents its metadata, which would be half of their size, and a shard has seven such files.
+    metadata = {path: json.loads(data) for path, data in files.items() if path.endswith(_GROUP_FILE)}
+    return files | {path: json.dumps(one, separators=(",", ":")).encode() for path, one in metadata.items()}
 
 
 def file_names(observations: int, points: int) -> Iterator[str]:
