@@ -155,7 +155,7 @@ class Campaign:
         evaluation.publish_policy(version, Store.open(self._run.store).read_policy(version))
         collected = self._fill(crew, self._run.evaluation, "evaluation", version, self._config.rollouts.evaluation)
         crew.dismiss()
-        return collected | self._trainer.evaluate(version)
+        return collected | dict(self._trainer.evaluate(version))
 
     def _fill(self, crew: Crew, path: Path, proposer: str, version: int, rollouts: int) -> dict[str, Any]:
         store, used = Store.open(path), self._run.objects_used()

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from cluster.configuration import CampaignConfig
 from cluster.figures import collection_figures
+from cluster.judging import RESULTS_FILE
 from cluster.ledger import Ledger
 from cluster.run_folder import RunFolder, read_json
 from shared.errors import UsageError
@@ -17,9 +18,6 @@ from shared.files import write_atomically
 from shared.policy import Policy
 from shared.store import Store
 from shared.store.provenance import software_versions
-
-RESULTS_FILE = "results.json"
-"""What the learner's evaluation leaves: rows by method and budget."""
 
 
 def write_report(run: RunFolder, config: CampaignConfig) -> None:

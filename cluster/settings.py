@@ -68,11 +68,12 @@ def parse_flags(command: type[Command], args: list[str], prog: str, default: Com
         UsageError: a value is of the right type but not allowed.
     """
     try:
-        parsed: Command = tyro.cli(command, prog=f"adaafford {prog}", args=args, default=default, config=FLAG_STYLE)
+        parsed = tyro.cli(command, prog=f"adaafford {prog}", args=args, default=default, config=FLAG_STYLE)
     except ValidationError as error:
         problem = error.errors()[0]
         name = ".".join(str(part) for part in problem["loc"])
         raise UsageError(f"flag for '{name}': {problem['msg']}; given {str(problem['input'])[:80]!r}") from None
+    assert parsed is not None
     return parsed
 
 

@@ -1,14 +1,22 @@
 """Training stages as child processes: the learner shares a process with neither Ray nor SAPIEN."""
 
+import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from cluster.configuration import CampaignConfig
+from cluster.run_folder import RunFolder
+from learner.configuration import LearnerConfig
 from shared.errors import UsageError, WorkerError
+from shared.files import read_bounded, write_atomically
+from shared.plan import ObjectRef
+from shared.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
+from shared.store import Store
 
-LEARNER_MODULE = "learner"
 THREADS = 2
 """Of torch, in a learner: the collectors rest while it trains."""
 PATIENCE_S = 10.0
@@ -16,21 +24,96 @@ PATIENCE_S = 10.0
 OUTPUT_FILE = "output.txt"
 
 
-def run_learner(arguments: Sequence[str], out: Path, say: Callable[[str], None]) -> None:
-    """Run `python -m learner ARGUMENTS` and wait; it dies with this process, however that dies.
+class Trainer:
+    """The training stages of one run; each starts from what the last one left, and leaves a whole policy.
+
+    prior -> aap-1 -> aip-1 (published as 1) -> aap-2 -> aip-2 (published as 2) -> ...
+    """
+
+    def __init__(self, run: RunFolder, config: CampaignConfig, say: Callable[[str], None]) -> None:
+        self._run = run
+        self._config = config
+        self._say = say
+
+    def prior(self) -> Mapping[str, Any]:
+        """The Where2Act prior, from the random round."""
+        return self._train("prior", "prior", None)
+
+    def aap(self, version: int) -> Mapping[str, Any]:
+        """AAP: from the prior at first, then fine-tuned with what its own AIP chose to try."""
+        return self._train("aap", f"aap-{version}", "prior" if version == 1 else f"aip-{version - 1}")
+
+    def aip(self, version: int) -> Mapping[str, Any]:
+        """AIP, for the AAP of the same version."""
+        return self._train("aip", f"aip-{version}", f"aap-{version}")
+
+    def publish(self, version: int) -> Mapping[str, Any]:
+        """Put the policy into the store, where collectors find it."""
+        folder = self._run.training(f"aip-{version}")
+        files = {name: read_bounded(folder / name, MAX_WEIGHTS_BYTES) for name in (WEIGHTS_FILE, POLICY_FILE)}
+        Store.open(self._run.store).publish_policy(version, files)
+        self._say(f"published policy {version}, {sum(map(len, files.values())) / 1e6:.1f} MB")
+        return {"policy": version}
+
+    def evaluate(self, version: int) -> Mapping[str, Any]:
+        """Judge the policy by what was tried on unseen objects."""
+        out = self._run.training("evaluate")
+        run_child("cluster.judging", [str(self._run.evaluation), str(version), str(out)], out, self._say)
+        return {"policy": version}
+
+    def _train(self, network: str, stage: str, init: str | None) -> dict[str, Any]:
+        out = self._run.training(stage)
+        out.mkdir(parents=True, exist_ok=True)
+        used = self._run.objects_used()
+        told = LearnerConfig(seed=self._config.seed, threads=THREADS, **dict(self._config.learner))
+        arguments = [network, "--store", str(self._run.store), "--out", str(out)]
+        arguments += ["--config", _written(out / "learner.toml", as_toml(told.model_dump(mode="json")))]
+        arguments += ["--train-objects", _written(out / "train.txt", _ids(used.train))]
+        if used.validation:
+            arguments += ["--validation-objects", _written(out / "validation.txt", _ids(used.validation))]
+        if init is not None:
+            arguments += ["--init", str(self._run.training(init))]
+        run_child("learner", arguments, out, lambda line: self._say(f"  {line}"))
+        return {"policy_folder": str(out.relative_to(self._run.path))}
+
+
+def as_toml(values: Mapping[str, Any], prefix: str = "") -> str:
+    """Nested settings as TOML; what is None is left to its default, since TOML has no word for it."""
+    lines, tables = [], []
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            tables.append(f"[{prefix}{name}]\n{as_toml(value, f'{prefix}{name}.')}")
+        elif value is not None:
+            # Numbers, booleans, strings and arrays of these are written alike in JSON and TOML.
+            lines.append(f"{name} = {json.dumps(value)}\n")
+    return "".join(lines + tables)
+
+
+def _written(path: Path, text: str) -> str:
+    write_atomically(path, text.encode())
+    return str(path)
+
+
+def _ids(refs: Sequence[ObjectRef]) -> str:
+    return "".join(f"{ref.id} {ref.category}\n" for ref in refs)
+
+
+def run_child(module: str, arguments: Sequence[str], out: Path, say: Callable[[str], None]) -> None:
+    """Run `python -m MODULE ARGUMENTS` and wait; it dies with this process, however that dies.
 
     Args:
-        arguments: after `python -m learner`.
-        out: folder that gets output.txt, everything the learner printed.
+        module: what to run.
+        arguments: its arguments.
+        out: folder that gets output.txt, everything that it printed.
         say: is given each line as it comes.
 
     Raises:
-        UsageError: the learner refused its input; its own line is the message.
+        UsageError: it refused its input; its own line is the message.
         WorkerError: it failed otherwise; the message names output.txt.
     """
     out.mkdir(parents=True, exist_ok=True)
     wrapper = [sys.executable, "-m", "cluster.lifeline", str(os.getpid())]
-    command = [*wrapper, sys.executable, "-m", LEARNER_MODULE, *arguments]
+    command = [*wrapper, sys.executable, "-m", module, *arguments]
     # A session of its own: Ctrl-C reaches this process alone, which then ends the learner in an orderly way.
     with (out / OUTPUT_FILE).open("w", encoding="utf-8") as log:
         child = subprocess.Popen(
@@ -48,10 +131,10 @@ def run_learner(arguments: Sequence[str], out: Path, say: Callable[[str], None])
         finally:
             _end(child)
     if child.returncode == UsageError.exit_code:
-        raise UsageError(last)
+        raise UsageError(last.removeprefix("error: "))
     if child.returncode != 0:
         raise WorkerError(
-            f"`python -m learner {' '.join(arguments)}` ended with code {child.returncode}; see {out / OUTPUT_FILE}"
+            f"`python -m {module} {' '.join(arguments)}` ended with code {child.returncode}; see {out / OUTPUT_FILE}"
         )
 
 

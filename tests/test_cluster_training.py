@@ -6,13 +6,18 @@ import subprocess
 import sys
 import textwrap
 import time
+import tomllib
 from pathlib import Path
 
 import psutil
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cluster import training
 from shared.errors import UsageError, WorkerError
+
+STAND_IN = "learner_stand_in"
 
 
 @pytest.fixture
@@ -20,7 +25,7 @@ def learner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A module that stands in for the learner: it does what its argument says."""
     folder = tmp_path / "modules"
     folder.mkdir()
-    (folder / "learner_stand_in.py").write_text(
+    (folder / f"{STAND_IN}.py").write_text(
         textwrap.dedent(
             """
             import os, sys, time
@@ -36,25 +41,24 @@ def learner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         )
     )
     monkeypatch.setenv("PYTHONPATH", f"{folder}{os.pathsep}{Path(__file__).parents[1]}")
-    monkeypatch.setattr(training, "LEARNER_MODULE", "learner_stand_in")
     return folder
 
 
 def test_its_lines_are_passed_on_and_kept(learner: Path, tmp_path: Path) -> None:
     lines: list[str] = []
-    training.run_learner(["work"], tmp_path / "out", lines.append)
+    training.run_child(STAND_IN, ["work"], tmp_path / "out", lines.append)
     assert lines == ["step 1", str(training.THREADS)]
     assert (tmp_path / "out" / training.OUTPUT_FILE).read_text().splitlines() == lines
 
 
 def test_what_it_refuses_is_refused_in_its_words(learner: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"^setting 'steps': too few$"):
-        training.run_learner(["refuse"], tmp_path, lambda line: None)
+        training.run_child(STAND_IN, ["refuse"], tmp_path, lambda line: None)
 
 
 def test_a_crash_names_its_output(learner: Path, tmp_path: Path) -> None:
     with pytest.raises(WorkerError, match=r"ended with code 7; see .*output\.txt$"):
-        training.run_learner(["crash"], tmp_path, lambda line: None)
+        training.run_child(STAND_IN, ["crash"], tmp_path, lambda line: None)
 
 
 def test_an_interrupt_ends_it(learner: Path, tmp_path: Path) -> None:
@@ -62,8 +66,8 @@ def test_an_interrupt_ends_it(learner: Path, tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        training.run_learner(["hang"], tmp_path, interrupt)
-    assert not [child for child in psutil.Process().children() if "learner_stand_in" in " ".join(child.cmdline())]
+        training.run_child(STAND_IN, ["hang"], tmp_path, interrupt)
+    assert not [child for child in psutil.Process().children() if STAND_IN in " ".join(child.cmdline())]
 
 
 def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> None:
@@ -71,8 +75,8 @@ def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> 
         [
             sys.executable,
             "-c",
-            "import pathlib, sys; from cluster import training; training.LEARNER_MODULE = 'learner_stand_in';"
-            f"training.run_learner(['hang'], pathlib.Path({str(tmp_path)!r}), lambda l: print(l, flush=True))",
+            "import pathlib; from cluster import training;"
+            f"training.run_child({STAND_IN!r}, ['hang'], pathlib.Path({str(tmp_path)!r}), lambda l: print(l, flush=True))",
         ],
         stdout=subprocess.PIPE,
     )
@@ -87,3 +91,17 @@ def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> 
     while children[0].is_running() and children[0].status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < deadline
         time.sleep(0.02)
+
+
+scalars = st.integers(-5, 5) | st.floats(allow_nan=False, allow_infinity=False) | st.booleans() | st.text('aé"\\\n ')
+settings = st.recursive(
+    scalars | st.lists(scalars, max_size=3),
+    lambda inner: st.dictionaries(st.sampled_from(["a", "b", "c"]), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.dictionaries(st.sampled_from(["a", "b", "c"]), settings))
+def test_settings_survive_toml(values: dict[str, object]) -> None:
+    assert tomllib.loads(training.as_toml(values)) == values
+    assert tomllib.loads(training.as_toml({**values, "none": None})) == values
