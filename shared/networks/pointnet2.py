@@ -84,6 +84,7 @@ class PointNet2(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
+        self.width = config.feature_width
         widths = [3]
         self.abstractions = nn.ModuleList()
         for layer_widths in config.abstraction:

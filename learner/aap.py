@@ -1,0 +1,211 @@
+"""Stage 2: Adaptive Affordance Prediction, as in the paper or from an oracle that was told the hidden facts.
+
+Shapes: B rollouts, n rows of each, K the longest context.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from learner.configuration import AapConfig
+from learner.data import Dataset, Split
+from learner.losses import action_scoring_loss, actionability_loss, distillation_loss, top_score
+from learner.metrics import discrimination
+from learner.oracle import OracleCritic
+from learner.sampling import OrderedRows, ProposalPool, draw_numbers, order_rows
+from learner.training import ParameterGroup, StepResult
+from shared.networks.aap import Aap
+from shared.networks.pointnet2 import EncodedClouds
+
+VALIDATION_ROLLOUTS = 32
+_VALIDATION_SEED = 20
+_CHUNK = 4
+"""Rollouts validated at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What AAP makes of ordered rows after every prefix of their context.
+
+    Attributes:
+        logits: of the action scores, [B, K + 1, n].
+        latents: z of the prefixes, [B, K + 1, latent_width].
+        encoded: the clouds.
+    """
+
+    logits: Tensor
+    latents: Tensor
+    encoded: EncodedClouds
+
+
+class AapStage:
+    """Trains `Aap` (AdaAfford, AAP Action Scoring Loss and AAP Actionability Scoring Loss).
+
+    A random subset of a rollout's interactions is the context; all rows that are not in it are predicted, after each of
+    its prefixes and after none. With an oracle, z is drawn to the oracle's as well.
+    """
+
+    name = "aap"
+
+    def __init__(
+        self,
+        aap: Aap,
+        dataset: Dataset,
+        parts: Split,
+        config: AapConfig,
+        pool: ProposalPool,
+        oracle: OracleCritic | None = None,
+    ) -> None:
+        self.module: nn.Module = aap
+        self.aap = aap
+        self.dataset = dataset
+        self.parts = parts
+        self.config = config
+        self.pool = pool
+        self.oracle = None if oracle is None else oracle.eval().requires_grad_(False)
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """All of AAP; what comes from an oracle moves more slowly."""
+        if self.oracle is None:
+            return [ParameterGroup(tuple(self.aap.parameters()))]
+        inherited = {
+            id(p)
+            for part in (self.aap.encoder, self.aap.action_encoder, self.aap.critic_head)
+            for p in part.parameters()
+        }
+        old = tuple(p for p in self.aap.parameters() if id(p) in inherited)
+        new = tuple(p for p in self.aap.parameters() if id(p) not in inherited)
+        return [ParameterGroup(new), ParameterGroup(old, self.config.inherited_rate)]
+
+    def loss(self, rng: np.random.Generator) -> StepResult:
+        """The losses on a few rollouts."""
+        config, train = self.config, self.parts.train
+        chosen = draw_numbers(len(train), min(config.batch_rollouts, len(train)), rng)
+        rollouts = [train[number] for number in chosen]
+        ordered = order_rows(self.dataset, rollouts, config.rows_per_rollout, rng, config.proposed_first)
+        context = ordered.longest_context(config.context)
+        prediction = predict(self.aap, self.dataset, ordered, context)
+        asked = ordered.asked(context)
+        success = self.dataset.rows.success[ordered.rows][:, None]
+        losses = {
+            "critic": action_scoring_loss(prediction.logits, success, asked),
+            "affordance": self._actionability_loss(ordered, prediction, rng),
+        }
+        if self.oracle is not None:
+            told = self._told(ordered)
+            losses["distillation"] = config.distillation * distillation_loss(prediction.latents, told, asked.any(-1))
+        return StepResult(losses, int(ordered.valid.sum()))
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Figures on objects not trained on, before and after the longest context; "score" is the cross entropy."""
+        rng = np.random.default_rng(_VALIDATION_SEED)
+        rollouts = self.parts.validation[:VALIDATION_ROLLOUTS]
+        scores: tuple[list[Tensor], list[Tensor]] = ([], [])
+        labels, losses = [], []
+        for start in range(0, len(rollouts), _CHUNK):
+            ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
+            context = ordered.longest_context(self.config.context)
+            prediction = predict(self.aap, self.dataset, ordered, context)
+            success, asked = self.dataset.rows.success[ordered.rows], ordered.asked(context)
+            losses.append(action_scoring_loss(prediction.logits, success[:, None], asked))
+            asked_last = asked[:, -1]
+            for kept, prefix in zip(scores, (0, -1), strict=True):
+                kept.append(torch.sigmoid(prediction.logits[:, prefix][asked_last]))
+            labels.append(success[asked_last])
+        before, after = (discrimination(torch.cat(kept).numpy(), torch.cat(labels).numpy()) for kept in scores)
+        return {
+            "score": float(torch.stack(losses).mean()),
+            "bce_without_tries": before.bce,
+            "bce_with_tries": after.bce,
+            "f_without_tries": before.f_score,
+            "f_with_tries": after.f_score,
+            "auc_without_tries": before.auc,
+            "auc_with_tries": after.auc,
+            "base_rate": after.base_rate,
+        }
+
+    def _actionability_loss(self, ordered: OrderedRows, prediction: Prediction, rng: np.random.Generator) -> Tensor:
+        """L1 to the mean of the best scores that the critic gives to the prior's proposals."""
+        config, aap = self.config, self.aap
+        sets, prefixes = prediction.latents.shape[:2]
+        which = torch.arange(sets).repeat_interleave(config.affordance_points)
+        count = len(which)
+        place = torch.from_numpy(rng.integers(0, ordered.valid.sum(dim=1).numpy()[which.numpy()]))
+        cloud = ordered.cloud[which, place]
+        slot = torch.from_numpy(rng.integers(0, self.pool.point.shape[1], count))
+        latents = prediction.latents[which, torch.from_numpy(rng.integers(0, prefixes, count))].detach()
+        whole_cloud = ordered.clouds[cloud]
+        point = self.pool.point[whole_cloud, slot]
+        frames = self.pool.draw(whole_cloud, slot, config.proposals, rng)
+        with torch.no_grad():
+            features = aap.encoder.at(prediction.encoded, cloud, point)
+            xyz = self.dataset.clouds.points[whole_cloud, point]
+            logits = aap.action_logits(features[:, None], xyz[:, None], frames, latents[:, None])
+            target = top_score(torch.sigmoid(logits), config.top)
+        return actionability_loss(aap.actionability(features, latents), target)
+
+    @torch.no_grad()
+    def _told(self, ordered: OrderedRows) -> Tensor:
+        """The oracle's z of each rollout, the mean over its rows: parts of one object may have other hinges."""
+        assert self.oracle is not None
+        latents = self.oracle.oracle(self.dataset.rows.facts[ordered.rows])
+        weights = ordered.valid[..., None].to(latents.dtype)
+        mean: Tensor = (latents * weights).sum(dim=1) / weights.sum(dim=1)
+        return mean
+
+
+class OracleStage:
+    """Trains the oracle critic, told the hidden facts outright, on the AAP action scoring loss; not in the paper."""
+
+    name = "oracle"
+
+    def __init__(self, critic: OracleCritic, dataset: Dataset, parts: Split, config: AapConfig) -> None:
+        self.module: nn.Module = critic
+        self.critic = critic
+        self.dataset = dataset
+        self.parts = parts
+        self.config = config
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """The oracle and the critic."""
+        return [ParameterGroup(tuple(self.critic.parameters()))]
+
+    def loss(self, rng: np.random.Generator) -> StepResult:
+        """The critic's loss on a few rollouts."""
+        train = self.parts.train
+        chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
+        ordered = order_rows(self.dataset, [train[k] for k in chosen], self.config.rows_per_rollout, rng)
+        logits = self.critic.logits(self.dataset, ordered)
+        success = self.dataset.rows.success[ordered.rows]
+        return StepResult({"critic": action_scoring_loss(logits, success, ordered.valid)}, int(ordered.valid.sum()))
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """The oracle critic's figures on objects not trained on: a bound for what adaptation can reach."""
+        rng = np.random.default_rng(_VALIDATION_SEED)
+        rollouts = self.parts.validation[:VALIDATION_ROLLOUTS]
+        scores, labels = [], []
+        for start in range(0, len(rollouts), _CHUNK):
+            ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
+            scores.append(torch.sigmoid(self.critic.logits(self.dataset, ordered))[ordered.valid])
+            labels.append(self.dataset.rows.success[ordered.rows][ordered.valid])
+        found = discrimination(torch.cat(scores).numpy(), torch.cat(labels).numpy())
+        return {"score": found.bce, "f_score": found.f_score, "auc": found.auc, "base_rate": found.base_rate}
+
+
+def predict(aap: Aap, dataset: Dataset, ordered: OrderedRows, context: int) -> Prediction:
+    """Score all rows after every prefix of the first `context` of them; each cloud is encoded once."""
+    rows, index = dataset.rows, ordered.rows
+    encoded = aap.encoder(dataset.clouds.select(ordered.clouds))
+    flat = aap.encoder.at(encoded, ordered.cloud.flatten(), rows.point[index].flatten())
+    features = flat.reshape(*index.shape, -1)
+    tries = index[:, :context]
+    codes, weights = aap.interaction_codes(
+        features[:, :context], rows.xyz[tries], rows.frame[tries], rows.motion[tries], rows.success[tries]
+    )
+    latents = aap.prefix_latents(codes, weights)
+    xyz, frames = rows.xyz[index][:, None], rows.frame[index][:, None]
+    return Prediction(aap.action_logits(features[:, None], xyz, frames, latents[:, :, None]), latents, encoded)

@@ -1,0 +1,187 @@
+"""Stage 3: Adaptive Interaction Proposal, supervised by a frozen AAP.
+
+Shapes: B ordered sets of interactions, n rows of each, K the longest context, Q points, S proposals.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from learner.configuration import AipConfig
+from learner.data import Dataset, Split
+from learner.losses import (
+    action_scoring_losses,
+    actionability_loss,
+    information_gains,
+    information_loss,
+    masked_mean,
+    top_score,
+)
+from learner.sampling import OrderedRows, ProposalPool, draw_numbers, frozen_features, order_rows
+from learner.training import ParameterGroup, StepResult
+from shared.networks.aap import Aap
+from shared.networks.aip import Aip
+from shared.networks.pointnet2 import EncodedClouds
+
+VALIDATION_ROLLOUTS = 32
+_VALIDATION_SEED = 21
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenAap:
+    """What a frozen AAP makes of every row and pool point, computed once a stage.
+
+    Attributes:
+        aap: frozen.
+        features: f_p|O of the rows, [I, feature_width].
+        pool_features: f_p|O of the pool's points, [O, P, feature_width].
+        codes: z_I of the rows, [I, latent_width].
+        weights: w_I of the rows, [I].
+    """
+
+    aap: Aap
+    features: Tensor
+    pool_features: Tensor
+    codes: Tensor
+    weights: Tensor
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, aap: Aap, dataset: Dataset, pool: ProposalPool) -> "FrozenAap":
+        """Encode everything."""
+        aap.eval().requires_grad_(False)
+        rows = dataset.rows
+        features = frozen_features(aap.encoder, dataset.clouds, rows.cloud, rows.point)
+        cloud = torch.arange(len(pool.point))[:, None].expand_as(pool.point)
+        pool_features = frozen_features(aap.encoder, dataset.clouds, cloud.flatten(), pool.point.flatten())
+        codes, weights = aap.interaction_codes(features, rows.xyz, rows.frame, rows.motion, rows.success)
+        return cls(aap, features, pool_features.reshape(*pool.point.shape, -1), codes, weights)
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """Targets of the AIP critic, and what it is told.
+
+    Attributes:
+        gains: drop of the AAP loss by each try, [B, K].
+        latents: z before each try, [B, K, latent_width].
+        scores: s^AAP_u|z of each try before it, [B, K].
+        mask: tries that have a target, [B, K].
+    """
+
+    gains: Tensor
+    latents: Tensor
+    scores: Tensor
+    mask: Tensor
+
+
+class AipStage:
+    """Trains `Aip` (AdaAfford, AIP Action Scoring Loss and AIP Actionability Scoring Loss); AAP stays as it is.
+
+    The drop of the AAP loss is measured on rows of the same rollout that are no context at all, the same for every
+    prefix, so that two losses differ by one try alone.
+    """
+
+    name = "aip"
+
+    def __init__(
+        self, aip: Aip, dataset: Dataset, parts: Split, config: AipConfig, pool: ProposalPool, frozen: FrozenAap
+    ) -> None:
+        self.module: nn.Module = aip
+        self.aip = aip
+        self.dataset = dataset
+        self.parts = parts
+        self.config = config
+        self.pool = pool
+        self.frozen = frozen
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """All of AIP, at one rate; nothing of AAP."""
+        return [ParameterGroup(tuple(self.aip.parameters()))]
+
+    def loss(self, rng: np.random.Generator) -> StepResult:
+        """Both losses on a few rollouts, several ordered subsets of each."""
+        train = self.parts.train
+        chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
+        ordered = self._order([train[number] for number in chosen], rng)
+        found = self.gains(ordered)
+        encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
+        predicted = self._predict(ordered, found, encoded)
+        losses = {
+            "critic": information_loss(predicted, found.gains, found.mask),
+            "affordance": self._actionability_loss(ordered, found, encoded, rng),
+        }
+        return StepResult(losses, int(ordered.valid.sum()))
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Figures on objects not trained on; "score" is the critic's L1, "score_of_median" that of a constant."""
+        rng = np.random.default_rng(_VALIDATION_SEED)
+        ordered = self._order(list(self.parts.validation[:VALIDATION_ROLLOUTS]), rng)
+        found = self.gains(ordered)
+        predicted = self._predict(ordered, found, self.aip.encoder(self.dataset.clouds.select(ordered.clouds)))
+        gains, guesses = found.gains[found.mask], predicted[found.mask]
+        together = torch.stack([gains, guesses])
+        varied = len(gains) > 1 and bool((together.std(dim=1) > 0).all())
+        return {
+            "score": float(information_loss(predicted, found.gains, found.mask)),
+            "score_of_median": float(masked_mean((found.gains - gains.median()).abs(), found.mask)),
+            "mean_gain": float(gains.mean()),
+            "correlation": float(torch.corrcoef(together)[0, 1]) if varied else float("nan"),
+        }
+
+    @torch.no_grad()
+    def gains(self, ordered: OrderedRows) -> Gains:
+        """How much each try lowers the AAP loss on the rows that are no context."""
+        frozen, rows = self.frozen, self.dataset.rows
+        context = ordered.longest_context(self.config.context)
+        tries = ordered.rows[:, :context]
+        latents = frozen.aap.prefix_latents(frozen.codes[tries], frozen.weights[tries])
+        features = frozen.features[ordered.rows][:, None]
+        xyz, frames = rows.xyz[ordered.rows][:, None], rows.frame[ordered.rows][:, None]
+        logits = frozen.aap.action_logits(features, xyz, frames, latents[:, :, None])
+        held_out = ordered.asked(context)[:, -1]
+        losses = action_scoring_losses(logits, rows.success[ordered.rows][:, None])
+        counts = held_out[:, None].to(losses.dtype)
+        per_prefix = (losses * counts).sum(dim=-1) / counts.sum(dim=-1).clamp_min(1.0)
+        own = torch.arange(context)
+        mask = ordered.valid[:, :context] & held_out.any(dim=1)[:, None]
+        return Gains(information_gains(per_prefix), latents[:, :-1], torch.sigmoid(logits[:, own, own]), mask)
+
+    def _order(self, rollouts: list[int], rng: np.random.Generator) -> OrderedRows:
+        repeated = [number for number in rollouts for _ in range(self.config.draws)]
+        return order_rows(self.dataset, repeated, self.config.rows_per_rollout, rng)
+
+    def _predict(self, ordered: OrderedRows, found: Gains, encoded: EncodedClouds) -> Tensor:
+        """AIP scores of the tries of the context, [B, K]."""
+        rows, tries = self.dataset.rows, ordered.rows[:, : found.gains.shape[1]]
+        cloud = ordered.cloud[:, : tries.shape[1]]
+        flat = self.aip.encoder.at(encoded, cloud.flatten(), rows.point[tries].flatten())
+        features = flat.reshape(*tries.shape, -1)
+        return self.aip.action_scores(features, rows.xyz[tries], rows.frame[tries], found.latents, found.scores)
+
+    def _actionability_loss(
+        self, ordered: OrderedRows, found: Gains, encoded: EncodedClouds, rng: np.random.Generator
+    ) -> Tensor:
+        """L1 to the mean of the best AIP scores of the prior's proposals."""
+        config, frozen, aip = self.config, self.frozen, self.aip
+        sets, prefixes = found.latents.shape[:2]
+        count = config.batch_rollouts * config.affordance_points
+        which = rng.integers(0, sets, count)
+        place = torch.from_numpy(rng.integers(0, ordered.valid.sum(dim=1).numpy()[which]))
+        cloud = ordered.cloud[torch.from_numpy(which), place]
+        latents = found.latents[torch.from_numpy(which), torch.from_numpy(rng.integers(0, prefixes, count))]
+        slot = torch.from_numpy(rng.integers(0, self.pool.point.shape[1], count))
+        whole_cloud = ordered.clouds[cloud]
+        point = self.pool.point[whole_cloud, slot]
+        frames = self.pool.draw(whole_cloud, slot, config.proposals, rng)
+        with torch.no_grad():
+            xyz, aap_features = self.dataset.clouds.points[whole_cloud, point], frozen.pool_features[whole_cloud, slot]
+            logits = frozen.aap.action_logits(aap_features[:, None], xyz[:, None], frames, latents[:, None])
+            believed = frozen.aap.actionability(aap_features, latents)
+            features = aip.encoder.at(encoded, cloud, point)
+            scores = aip.action_scores(features[:, None], xyz[:, None], frames, latents[:, None], torch.sigmoid(logits))
+            target = top_score(scores, config.top)
+        return actionability_loss(aip.actionability(features, latents, believed), target)

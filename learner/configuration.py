@@ -1,0 +1,91 @@
+"""Settings of the learner; the defaults fit a few thousand interactions and two cores."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from shared.configuration import StrictModel
+from shared.networks.configuration import NetworkConfig
+
+
+class TrainingConfig(StrictModel):
+    """What the training loop itself needs to know."""
+
+    steps: int = Field(300, ge=1)
+    seconds: float | None = Field(None, gt=0)
+    """End after this much training time, whatever `steps` says; such a run cannot be repeated bit for bit."""
+    learning_rate: float = Field(1e-3, gt=0)
+    """As published: 1e-3 for the prior, 1e-4 for the alternation, on a hundred times more steps."""
+    decay: float = Field(0.9, gt=0, le=1)
+    """Factor of the learning rate every `decay_steps`, as published."""
+    decay_steps: int = Field(5_000, ge=1)
+    weight_decay: float = Field(1e-5, ge=0)
+    validate_every: int = Field(50, ge=1)
+    """Steps between two looks at the validation objects; the best weights are kept."""
+    patience: int = Field(6, ge=1)
+    """Looks without improvement after which training ends."""
+    checkpoint_seconds: float = Field(5.0, ge=0)
+
+
+class PriorConfig(TrainingConfig):
+    """The Where2Act prior."""
+
+    batch_clouds: int = Field(12, ge=1)
+    actions_per_cloud: int = Field(16, ge=1)
+    """At the most; a cloud of a restart rollout has 8."""
+    proposals: int = Field(100, ge=1)
+    """Draws a point, for the proposal and for the actionability loss, as published."""
+
+
+class AapConfig(TrainingConfig):
+    """Adaptive Affordance Prediction."""
+
+    training: Literal["paper", "privileged"] = "paper"
+    """"paper": end to end. "privileged": first an oracle critic that is told the hidden facts; AAP starts from it and
+    learns to infer them. An AAP that is already trained is fine-tuned end to end either way."""
+    steps: int = Field(250, ge=1)
+    batch_rollouts: int = Field(4, ge=1)
+    rows_per_rollout: int = Field(32, ge=2)
+    """At the most, drawn anew each time."""
+    context: int = Field(8, ge=1)
+    """The longest context; every shorter one, and none, is trained in the same pass."""
+    proposed_first: float = Field(0.5, ge=0, le=1)
+    """How often the tries that a policy proposed come first in the context, where a rollout has some."""
+    proposals: int = Field(100, ge=1)
+    top: int = Field(5, ge=1)
+    """Best proposals whose mean score is a point's actionability, as published."""
+    affordance_points: int = Field(4, ge=1)
+    """Points a rollout and step for the actionability loss."""
+    distillation: float = Field(1.0, ge=0)
+    """Weight of the loss that draws z to the oracle's; privileged training only."""
+    inherited_rate: float = Field(0.2, ge=0, le=1)
+    """Factor of the learning rate for what comes from the oracle; privileged training only."""
+    oracle_steps: int = Field(250, ge=1)
+    """Steps of the oracle critic; privileged training only."""
+
+
+class AipConfig(TrainingConfig):
+    """Adaptive Interaction Proposal."""
+
+    steps: int = Field(200, ge=1)
+    batch_rollouts: int = Field(4, ge=1)
+    rows_per_rollout: int = Field(32, ge=2)
+    context: int = Field(4, ge=1)
+    """Tries of an ordered subset; each gives one target."""
+    draws: int = Field(4, ge=1)
+    """Ordered subsets a rollout and step, which share the encoded clouds."""
+    proposals: int = Field(100, ge=1)
+    top: int = Field(5, ge=1)
+    affordance_points: int = Field(4, ge=1)
+
+
+class LearnerConfig(StrictModel):
+    """Everything that `python -m learner` may be told by a file."""
+
+    seed: int = Field(0, ge=0)
+    threads: int | None = Field(None, ge=1, le=1024)
+    """Of PyTorch; unset: as many as it chooses. Bits may differ between numbers of threads."""
+    network: NetworkConfig = NetworkConfig()
+    prior: PriorConfig = PriorConfig()
+    aap: AapConfig = AapConfig()
+    aip: AipConfig = AipConfig()

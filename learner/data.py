@@ -1,0 +1,242 @@
+"""A store as compact arrays: every cloud once, its neighbour indices once, and rows grouped by rollout.
+
+Shapes: O clouds, N points, I interactions.
+"""
+
+import zlib
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from learner.facts import HiddenColumns, facts_of
+from shared.errors import StoreError, UsageError
+from shared.geometry import view_from_world
+from shared.grouping import Grouping, group_cloud
+from shared.networks.configuration import NetworkConfig
+from shared.networks.pointnet2 import CloudBatch
+from shared.store.columns import INTERACTION_COLUMNS
+from shared.store.store import Store
+from shared.store.tables import column_values
+from shared.vocabulary import Float32, OutcomeKind
+
+COLUMNS = (
+    *("plan_key", "rollout", "object_id", "part_mass", "joint_friction", "surface_friction", "direction", "step"),
+    *("point_index", "point", "rotation", "role", "policy_version", "method", "budget", "target_part"),
+    *("joint_positions", "joint_limits", "outcome", "motion", "success", "start_joint_position"),
+    *("end_joint_position", "displacement"),
+)
+VALIDATION_SHARE = 5
+"""Without lists of objects, one object in this many is kept for validation, chosen by a hash of its id."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Interactions, one an entry; vectors in the view frame of their cloud.
+
+    Attributes:
+        cloud: [I], index of the cloud.
+        point: [I], index of p in it.
+        xyz: p, [I, 3].
+        frame: approach and forward, [I, 6].
+        motion: m, [I].
+        success: r as 0 or 1, [I].
+        step: [I], number within the rollout.
+        proposed: [I], whether a policy chose the action.
+        facts: [I, FACTS_WIDTH], for the oracle only.
+        role, method: [I], names (see `shared.records.InteractionRecord`).
+        budget: [I].
+    """
+
+    cloud: Tensor
+    point: Tensor
+    xyz: Tensor
+    frame: Tensor
+    motion: Tensor
+    success: Tensor
+    step: Tensor
+    proposed: Tensor
+    facts: Tensor
+    role: NDArray[np.str_]
+    method: NDArray[np.str_]
+    budget: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.cloud)
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """A store's interactions.
+
+    Attributes:
+        task: of the store.
+        clouds: every cloud once, with its neighbour indices, view frame.
+        movable: [O, N].
+        rows: labels only; rows of failed infrastructure are left out.
+        rollouts: for each rollout, its rows in order of step.
+        objects: for each rollout, its object's id.
+    """
+
+    task: str
+    clouds: CloudBatch
+    movable: Tensor
+    rows: Rows
+    rollouts: tuple[Tensor, ...]
+    objects: tuple[str, ...]
+
+    def rollouts_of(self, objects: Collection[str]) -> tuple[int, ...]:
+        """Numbers of the rollouts of some objects."""
+        return tuple(number for number, name in enumerate(self.objects) if name in objects)
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Rollouts to learn from, and rollouts of other objects to judge by."""
+
+    train: tuple[int, ...]
+    validation: tuple[int, ...]
+
+
+def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
+    """Load all labels of a store.
+
+    Raises:
+        StoreError: the store is damaged, or holds no label at all.
+    """
+    table = store.interactions(COLUMNS)
+    known = {column.name: column for column in INTERACTION_COLUMNS}
+    cells = {name: column_values(table, known[name]) for name in (*COLUMNS, "observation")}
+    keep = np.flatnonzero([OutcomeKind(kind).is_label for kind in cells["outcome"]])
+    if not len(keep):
+        raise StoreError(f"{store.path}: holds no interaction to learn from; collect some first")
+    cells = {name: _take(values, keep) for name, values in cells.items()}
+    shards = _take(table.column("shard").to_pylist(), keep)
+    names = list(zip(shards, cells["observation"].tolist(), strict=True))
+    index = {name: number for number, name in enumerate(sorted(set(names)))}
+    points, movable, views = _read_clouds(store, list(index))
+    cloud = np.array([index[name] for name in names])
+    rows = _rows(cells, cloud, points, views)
+    rollouts = _group(cells)
+    batch = CloudBatch.of(points, group_all(points, config))
+    return Dataset(
+        task=store.setting.task,
+        clouds=batch,
+        movable=torch.from_numpy(np.stack(movable)),
+        rows=rows,
+        rollouts=tuple(torch.from_numpy(found) for found in rollouts),
+        objects=tuple(str(cells["object_id"][found[0]]) for found in rollouts),
+    )
+
+
+def group_all(points: Iterable[Float32], config: NetworkConfig) -> list[Grouping]:
+    """Neighbour indices of clouds."""
+    return [group_cloud(cloud, config) for cloud in points]
+
+
+def split(dataset: Dataset, train: Collection[str] | None, validation: Collection[str] | None) -> Split:
+    """Split a data set's rollouts by object.
+
+    Args:
+        dataset: the interactions.
+        train: ids of the objects to learn from; None: all but those for validation.
+        validation: ids of the objects to judge by; None: all but those for training, or, where these are not given
+            either, one object in five, by a hash of its id.
+
+    Raises:
+        UsageError: an object is in both, or one of the two has no rollout.
+    """
+    leaked = sorted(set(train or ()) & set(validation or ()))
+    if leaked:
+        raise UsageError(f"object '{leaked[0]}' is listed for training and for validation; list each object once")
+    if validation is None:
+        # A rank, instead of a remainder of the hash, never comes out empty for few objects.
+        left = sorted(set(dataset.objects) - set(train or ()), key=lambda name: (zlib.crc32(name.encode()), name))
+        validation = left if train is not None else left[: max(1, len(left) // VALIDATION_SHARE)]
+    if train is None:
+        train = set(dataset.objects) - set(validation)
+    parts = Split(dataset.rollouts_of(train), dataset.rollouts_of(validation))
+    for name, found in (("training", parts.train), ("validation", parts.validation)):
+        if not found:
+            raise UsageError(f"no rollout of the store is of an object for {name}; collect or list more objects")
+    return parts
+
+
+def _take(values: Any, keep: NDArray[np.int64]) -> Any:
+    return values[keep] if isinstance(values, np.ndarray) else [values[row] for row in keep]
+
+
+def _read_clouds(
+    store: Store, names: list[tuple[str, int]]
+) -> tuple[list[Float32], list[NDArray[np.bool_]], NDArray[np.float64]]:
+    """Clouds by shard and index: points in the view frame, movable masks, and the turn from world to view [O, 3, 3]."""
+    points, movable, views = [], [], []
+    shard, arrays = "", None
+    for name, index in names:
+        if arrays is None or name != shard:
+            shard, arrays = name, store.read_observations(name)
+        if not 0 <= index < len(arrays):
+            raise StoreError(f"{store.path}: shard {name} has no observation {index}; it is damaged")
+        view = view_from_world(arrays.world_from_camera[index])
+        points.append((arrays.points[index] @ view.T.astype(np.float32)).astype(np.float32))
+        movable.append(arrays.movable[index])
+        views.append(view)
+    return points, movable, np.stack(views)
+
+
+def _rows(cells: dict[str, Any], cloud: NDArray[np.int64], points: list[Float32], views: NDArray[np.float64]) -> Rows:
+    view = views[cloud]
+    rotation = cells["rotation"].reshape(-1, 3, 3)
+    turned = np.einsum("iab,ibc->iac", view, rotation)
+    frame = np.concatenate([turned[:, :, 2], turned[:, :, 0]], axis=1)
+    point = cells["point_index"].astype(np.int64)
+    if point.min() < 0 or point.max() >= len(points[0]):
+        raise StoreError("the store names a point that its cloud does not have; run `adaafford store verify`")
+    hidden = HiddenColumns(
+        part=list(zip(cells["object_id"], cells["target_part"].tolist(), strict=True)),
+        point=cells["point"],
+        displacement=cells["displacement"],
+        motion=cells["end_joint_position"] - cells["start_joint_position"],
+        room=_room(cells),
+        dynamics=np.stack([cells[name] for name in ("part_mass", "joint_friction", "surface_friction")], axis=1),
+        direction=cells["direction"],
+        view=view,
+    )
+    return Rows(
+        cloud=torch.from_numpy(cloud),
+        point=torch.from_numpy(point),
+        xyz=torch.from_numpy(np.stack([points[c][p] for c, p in zip(cloud, point, strict=True)])),
+        frame=torch.from_numpy(frame.astype(np.float32)),
+        motion=torch.from_numpy(cells["motion"].astype(np.float32)),
+        success=torch.from_numpy(cells["success"].astype(np.float32)),
+        step=torch.from_numpy(cells["step"].astype(np.int64)),
+        proposed=torch.from_numpy(cells["policy_version"] > 0),
+        facts=torch.from_numpy(facts_of(hidden).astype(np.float32)),
+        role=np.array(cells["role"]),
+        method=np.array(cells["method"]),
+        budget=cells["budget"].astype(np.int64),
+    )
+
+
+def _room(cells: dict[str, Any]) -> NDArray[np.float64]:
+    """How far each row's target joint can go up and down from where it starts, [I, 2]."""
+    room = np.zeros((len(cells["step"]), 2))
+    for row, part in enumerate(cells["target_part"].tolist()):
+        positions, limits = cells["joint_positions"][row], cells["joint_limits"][row].reshape(-1, 2)
+        if 1 <= part <= min(len(positions), len(limits)):
+            low, high = limits[part - 1]
+            room[row] = high - positions[part - 1], positions[part - 1] - low
+    return room
+
+
+def _group(cells: dict[str, Any]) -> list[NDArray[np.int64]]:
+    """Rows of each rollout, in order of step; rollouts in order of plan and number."""
+    groups: dict[tuple[str, int], list[int]] = {}
+    for row, key in enumerate(zip(cells["plan_key"], cells["rollout"].tolist(), strict=True)):
+        groups.setdefault(key, []).append(row)
+    steps = cells["step"]
+    return [np.array(sorted(groups[key], key=lambda row: steps[row])) for key in sorted(groups)]

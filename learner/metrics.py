@@ -1,0 +1,86 @@
+"""How well scores tell successes from failures. NaN where a figure is not defined (no row, or one class only)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+THRESHOLD = 0.5
+"""Where a score counts as a predicted success, as in the published code."""
+_MIN_PROBABILITY = 1e-7
+
+
+@dataclass(frozen=True, slots=True)
+class Discrimination:
+    """Figures of one critic on one set of rows.
+
+    Attributes:
+        f_score: F1 of predicting success at the threshold 0.5.
+        best_f_score: F1 at the threshold that is best in hindsight.
+        bce: binary cross entropy, nats.
+        auc: area under the ROC curve; ties count half.
+        base_rate: share of successes.
+        rows: how many.
+    """
+
+    f_score: float
+    best_f_score: float
+    bce: float
+    auc: float
+    base_rate: float
+    rows: int
+
+
+def discrimination(scores: ArrayLike, successes: ArrayLike) -> Discrimination:
+    """All figures.
+
+    Args:
+        scores: probabilities, [I].
+        successes: [I].
+    """
+    probabilities = np.asarray(scores, dtype=np.float64)
+    labels = np.asarray(successes, dtype=bool)
+    return Discrimination(
+        f_score=f_score(probabilities >= THRESHOLD, labels),
+        best_f_score=best_f_score(probabilities, labels),
+        bce=cross_entropy(probabilities, labels),
+        auc=area_under_roc(probabilities, labels),
+        base_rate=float(labels.mean()) if len(labels) else float("nan"),
+        rows=len(labels),
+    )
+
+
+def f_score(predicted: NDArray[np.bool_], labels: NDArray[np.bool_]) -> float:
+    """F1 = 2 TP / (2 TP + FP + FN); NaN where there is nothing to find and nothing was claimed."""
+    claimed_or_true = int(predicted.sum()) + int(labels.sum())
+    return 2.0 * int((predicted & labels).sum()) / claimed_or_true if claimed_or_true else float("nan")
+
+
+def best_f_score(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:
+    """The highest F1 that any threshold gives; NaN without a success."""
+    if not labels.any():
+        return float("nan")
+    order = np.argsort(-scores, kind="stable")
+    hits = np.cumsum(labels[order])
+    # A threshold cannot part equal scores: only the last of each run of equals is reached by one.
+    reached = np.append(np.diff(scores[order]) != 0, True)
+    f = 2.0 * hits / (np.arange(1, len(labels) + 1) + labels.sum())
+    return float(f[reached].max())
+
+
+def cross_entropy(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:
+    """Mean binary cross entropy, nats."""
+    if not len(labels):
+        return float("nan")
+    clipped = np.clip(scores, _MIN_PROBABILITY, 1.0 - _MIN_PROBABILITY)
+    return float(-np.log(np.where(labels, clipped, 1.0 - clipped)).mean())
+
+
+def area_under_roc(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:
+    """Probability that a success scores above a failure."""
+    positives, negatives = int(labels.sum()), int((~labels).sum())
+    if not positives or not negatives:
+        return float("nan")
+    _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(counts) - (counts - 1) / 2.0)[inverse]
+    return float((ranks[labels].sum() - positives * (positives + 1) / 2.0) / (positives * negatives))

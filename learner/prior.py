@@ -1,0 +1,79 @@
+"""Stage 1: the Where2Act prior.
+
+Its proposal network learns from successful orientations, its critic from all rows, its affordance from its critic.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from learner.configuration import PriorConfig
+from learner.data import Dataset, Split
+from learner.losses import action_scoring_loss, actionability_loss, mean_score, proposal_loss
+from learner.metrics import discrimination
+from learner.sampling import draw_numbers, frozen_features
+from learner.training import ParameterGroup, StepResult
+from shared.networks.prior import Prior
+
+
+class PriorStage:
+    """Trains `Prior` (Where2Act): three losses in one pass, each with its own supervision."""
+
+    name = "prior"
+
+    def __init__(self, prior: Prior, dataset: Dataset, parts: Split, config: PriorConfig) -> None:
+        self.module: nn.Module = prior
+        self.prior = prior
+        self.dataset = dataset
+        self.config = config
+        self._rows_of_cloud = _rows_of_clouds(dataset, parts.train)
+        self._validation = torch.cat([dataset.rollouts[number] for number in parts.validation])
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """All of the prior, at one rate."""
+        return [ParameterGroup(tuple(self.prior.parameters()))]
+
+    def loss(self, rng: np.random.Generator) -> StepResult:
+        """The three losses on the rows of a few clouds."""
+        chosen = draw_numbers(len(self._rows_of_cloud), min(self.config.batch_clouds, len(self._rows_of_cloud)), rng)
+        most = self.config.actions_per_cloud
+        picked = [rng.permutation(self._rows_of_cloud[number])[:most] for number in chosen]
+        index = torch.from_numpy(np.concatenate(picked))
+        rows, prior = self.dataset.rows, self.prior
+        clouds, cloud = torch.unique(rows.cloud[index], return_inverse=True)
+        features = prior.encoder.at(prior.encoder(self.dataset.clouds.select(clouds)), cloud, rows.point[index])
+        xyz, frames, success = rows.xyz[index], rows.frame[index], rows.success[index]
+        shape = (len(index), self.config.proposals, prior.config.noise_width)
+        noise = torch.from_numpy(rng.standard_normal(shape).astype(np.float32))
+        proposals = prior.propose(features[:, None], noise)
+        with torch.no_grad():
+            scores = torch.sigmoid(prior.action_logits(features[:, None], xyz[:, None], proposals))
+        return StepResult(
+            {
+                "critic": action_scoring_loss(prior.action_logits(features, xyz, frames), success),
+                "proposal": proposal_loss(proposals[success > 0], frames[success > 0]),
+                "affordance": actionability_loss(prior.actionability(features), mean_score(scores)),
+            },
+            len(index),
+        )
+
+    def validate(self) -> dict[str, float]:
+        """The critic's figures on objects not trained on; "score" is its cross entropy."""
+        scores, success = self.scores(self._validation), self.dataset.rows.success[self._validation]
+        found = discrimination(scores.numpy(), success.numpy())
+        return {"score": found.bce, "f_score": found.f_score, "auc": found.auc, "base_rate": found.base_rate}
+
+    @torch.no_grad()
+    def scores(self, index: Tensor) -> Tensor:
+        """The critic's scores of rows."""
+        rows = self.dataset.rows
+        features = frozen_features(self.prior.encoder, self.dataset.clouds, rows.cloud[index], rows.point[index])
+        return torch.sigmoid(self.prior.action_logits(features, rows.xyz[index], rows.frame[index]))
+
+
+def _rows_of_clouds(dataset: Dataset, rollouts: tuple[int, ...]) -> list[np.ndarray]:
+    """The rows of each cloud that the rollouts have."""
+    rows = torch.cat([dataset.rollouts[number] for number in rollouts])
+    cloud = dataset.rows.cloud[rows].numpy()
+    order = np.argsort(cloud, kind="stable")
+    return np.split(rows.numpy()[order], np.flatnonzero(np.diff(cloud[order])) + 1)

@@ -1,0 +1,146 @@
+"""Batches: which rows are context, which are asked about, and which clouds that needs.
+
+Shapes: B ordered sets of interactions, n rows of each (padded), K the longest context, Q points, S proposals.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from learner.data import Dataset
+from shared.networks.pointnet2 import CloudBatch, PointNet2
+from shared.networks.prior import Prior
+
+ENCODING_CHUNK = 16
+"""Clouds encoded at once where no gradient is needed; bounds memory."""
+POOL_POINTS = 8
+"""Movable points of each cloud that proposals are drawn at."""
+
+
+@dataclass(frozen=True, slots=True)
+class OrderedRows:
+    """Ordered sets of interactions, each of one rollout; the first are context for the others.
+
+    Attributes:
+        rows: [B, n], indices into the data set's rows; padding repeats a row.
+        valid: [B, n], false for padding.
+        clouds: [U], the clouds that occur, each once.
+        cloud: [B, n], index into `clouds`.
+    """
+
+    rows: Tensor
+    valid: Tensor
+    clouds: Tensor
+    cloud: Tensor
+
+    def longest_context(self, limit: int) -> int:
+        """The longest context, of at most `limit` tries, that leaves a row to ask about."""
+        return min(limit, self.rows.shape[1] - 1)
+
+    def asked(self, context: int) -> Tensor:
+        """Which rows each prefix of the context is asked about: those after it, [B, context + 1, n].
+
+        Context and questions never overlap.
+        """
+        place = torch.arange(self.rows.shape[1])
+        prefix = torch.arange(context + 1)
+        return (place[None, None] >= prefix[None, :, None]) & self.valid[:, None]
+
+
+def order_rows(
+    dataset: Dataset,
+    rollouts: Sequence[int],
+    size: int,
+    rng: np.random.Generator,
+    proposed_first: float = 0.0,
+) -> OrderedRows:
+    """A random ordered subset of each rollout's rows.
+
+    Args:
+        dataset: the interactions.
+        rollouts: which ones, [B]; a rollout may occur more than once.
+        size: n, the most rows of each.
+        rng: draws the orders.
+        proposed_first: how often the tries that a policy proposed come first, in the order in which they were made
+            (AdaAfford, Training Strategy: AAP is fine-tuned with the proposed interactions).
+    """
+    width = min(size, max(len(dataset.rollouts[number]) for number in rollouts))
+    rows = np.zeros((len(rollouts), width), dtype=np.int64)
+    valid = np.zeros((len(rollouts), width), dtype=bool)
+    proposed = dataset.rows.proposed.numpy()
+    for place, number in enumerate(rollouts):
+        order = rng.permutation(dataset.rollouts[number].numpy())
+        if rng.random() < proposed_first:
+            # The rows of a rollout are in order of step, so that a sort by row is a sort by step.
+            first = np.array([row for row in dataset.rollouts[number].tolist() if proposed[row]], dtype=np.int64)
+            order = np.concatenate([first, order[~proposed[order]]])
+        order = order[:width]
+        rows[place], valid[place, : len(order)] = order[0], True
+        rows[place, : len(order)] = order
+    clouds, cloud = torch.unique(dataset.rows.cloud[torch.from_numpy(rows)], return_inverse=True)
+    return OrderedRows(torch.from_numpy(rows), torch.from_numpy(valid), clouds, cloud)
+
+
+@dataclass(frozen=True, slots=True)
+class ProposalPool:
+    """A few movable points of each cloud with their features under the frozen prior, to draw proposals at.
+
+    Attributes:
+        point: [O, P], index in the cloud.
+        features: [O, P, feature_width], of the prior.
+        prior: whose proposal network draws.
+    """
+
+    point: Tensor
+    features: Tensor
+    prior: Prior
+
+    @classmethod
+    def of(cls, dataset: Dataset, prior: Prior, rng: np.random.Generator) -> "ProposalPool":
+        """Draw the points once for all of a training stage, since the prior does not change in it."""
+        chosen = []
+        for movable in dataset.movable.numpy():
+            candidates = np.flatnonzero(movable) if movable.any() else np.arange(len(movable))
+            chosen.append(rng.choice(candidates, POOL_POINTS))
+        point = torch.from_numpy(np.stack(chosen))
+        cloud = torch.arange(len(point))[:, None].expand_as(point)
+        features = frozen_features(prior.encoder, dataset.clouds, cloud.flatten(), point.flatten())
+        return cls(point, features.reshape(*point.shape, -1), prior)
+
+    @torch.no_grad()
+    def draw(self, cloud: Tensor, slot: Tensor, count: int, rng: np.random.Generator) -> Tensor:
+        """`count` rotations at points of the pool, given by cloud and slot, [Q] each; [Q, count, 6]."""
+        noise = rng.standard_normal((len(cloud), count, self.prior.config.noise_width)).astype(np.float32)
+        return self.prior.propose(self.features[cloud, slot][:, None], torch.from_numpy(noise))
+
+
+@torch.no_grad()
+def frozen_features(encoder: PointNet2, clouds: CloudBatch, cloud: Tensor, point: Tensor) -> Tensor:
+    """Features of points under an encoder that is not trained, [Q, feature_width]; each cloud is encoded once.
+
+    Args:
+        encoder: in evaluation mode for the duration.
+        clouds: all clouds.
+        cloud: [Q], which of them.
+        point: [Q].
+    """
+    was_training = encoder.training
+    encoder.eval()
+    features = torch.empty(len(cloud), encoder.width)
+    needed, inverse = torch.unique(cloud, return_inverse=True)
+    for start in range(0, len(needed), ENCODING_CHUNK):
+        chunk = needed[start : start + ENCODING_CHUNK]
+        here = torch.nonzero((inverse >= start) & (inverse < start + len(chunk))).flatten()
+        encoded = encoder(clouds.select(chunk))
+        features[here] = encoder.at(encoded, inverse[here] - start, point[here])
+    encoder.train(was_training)
+    return features
+
+
+def draw_numbers(count: int, size: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """`size` numbers below `count`, each once where there are enough."""
+    return rng.choice(count, size, replace=size > count)

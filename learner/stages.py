@@ -1,0 +1,192 @@
+"""The three stages as jobs: a store and a policy in, a better policy out, finished at most once.
+
+OUT/ of a stage
+    config.json            what it was told, resolved
+    metrics.jsonl          one line a validation
+    checkpoint.safetensors until it is done
+    oracle/                privileged AAP only: the same for the oracle critic, and oracle.safetensors
+    weights.safetensors    the policy, all three modules
+    policy.json
+    done.json              written last
+"""
+
+import copy
+import hashlib
+import json
+from collections.abc import Collection
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from safetensors.torch import save
+
+from learner.aap import AapStage, OracleStage
+from learner.aip import AipStage, FrozenAap
+from learner.configuration import LearnerConfig
+from learner.data import Dataset, Split, load_dataset, split
+from learner.oracle import OracleCritic
+from learner.prior import PriorStage
+from learner.sampling import ProposalPool
+from learner.training import CHECKPOINT_FILE, TrainingResult, train, without_nan
+from shared.errors import UsageError
+from shared.files import read_bounded, write_atomically
+from shared.policy import MAX_POLICY_JSON_BYTES, MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE, Policy
+from shared.seeds import generator, torch_seed
+from shared.store.store import Store
+
+DONE_FILE = "done.json"
+CONFIG_FILE = "config.json"
+ORACLE_FILE = "oracle.safetensors"
+
+StageName = Literal["prior", "aap", "aip"]
+
+
+@dataclass(frozen=True, slots=True)
+class StageJob:
+    """What one stage is run on.
+
+    Attributes:
+        stage: which one.
+        store: folder of the store.
+        out: folder for what it makes.
+        init: folder with the policy to start from; None: random weights (the prior only).
+        train_objects: ids of the objects to learn from (see `learner.data.split`).
+        validation_objects: ids of the objects to judge by.
+    """
+
+    stage: StageName
+    store: Path
+    out: Path
+    init: Path | None = None
+    train_objects: Collection[str] | None = None
+    validation_objects: Collection[str] | None = None
+
+
+def run_stage(job: StageJob, config: LearnerConfig) -> Policy:
+    """Run a stage, go on with it after a kill, or return what it made where it is done.
+
+    Raises:
+        UsageError: the store or the policy is missing or of another task, objects leak between the parts, or `out`
+            holds another run.
+        StoreError: the store, the policy or a checkpoint is damaged.
+    """
+    store = Store.open(job.store)
+    policy = _initial_policy(job, store, config)
+    fingerprint = _fingerprint(job, config, store, policy)
+    if (job.out / DONE_FILE).exists():
+        _check_done(job.out / DONE_FILE, fingerprint)
+        return read_policy_folder(job.out)
+    try:
+        job.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"--out {job.out}: cannot be made ({error.strerror}); choose another folder") from None
+    write_atomically(job.out / CONFIG_FILE, config.model_dump_json(indent=1).encode())
+    dataset = load_dataset(store, policy.config)
+    parts = split(dataset, job.train_objects, job.validation_objects)
+    result = _train(job, config, policy, dataset, parts, fingerprint)
+    policy.with_trained(job.stage)
+    for name, data in policy.to_files().items():
+        write_atomically(job.out / name, data)
+    done = {"stage": job.stage, "fingerprint": fingerprint, **asdict(result), "metrics": without_nan(result.metrics)}
+    write_atomically(job.out / DONE_FILE, json.dumps(done, indent=1).encode())
+    for folder in (job.out, job.out / "oracle"):
+        (folder / CHECKPOINT_FILE).unlink(missing_ok=True)
+    return policy
+
+
+def read_policy_folder(folder: Path) -> Policy:
+    """The policy that a stage left in its folder.
+
+    Raises:
+        UsageError: there is none.
+        StoreError: it is damaged.
+    """
+    if not (folder / POLICY_FILE).is_file():
+        raise UsageError(f"{folder}: holds no {POLICY_FILE}; name the --out of a finished stage")
+    limits = {POLICY_FILE: MAX_POLICY_JSON_BYTES, WEIGHTS_FILE: MAX_WEIGHTS_BYTES}
+    return Policy.from_files({name: read_bounded(folder / name, limit) for name, limit in limits.items()})
+
+
+def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Policy:
+    task = store.setting.task
+    if job.init is None:
+        if job.stage != "prior":
+            before = {"aap": "prior", "aip": "aap"}[job.stage]
+            raise UsageError(f"the stage '{job.stage}' starts from a policy: add --init with the --out of '{before}'")
+        return Policy.untrained(task, config.network, torch_seed(config.seed, "learner.weights") % 2**32)
+    policy = read_policy_folder(job.init)
+    if policy.task != task:
+        raise UsageError(f"{job.init}: a policy for '{policy.task}', but the store is of '{task}'; use one of its task")
+    needed: dict[StageName, tuple[Literal["prior", "aap"], ...]] = {
+        "prior": (),
+        "aap": ("prior",),
+        "aip": ("prior", "aap"),
+    }
+    policy.require(*needed[job.stage])
+    return policy
+
+
+def _train(
+    job: StageJob, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split, fingerprint: str
+) -> TrainingResult:
+    rng = generator(config.seed, f"learner.{job.stage}.pool")
+    if job.stage == "prior":
+        policy.prior.requires_grad_(True)
+        stage = PriorStage(policy.prior, dataset, parts, config.prior)
+        return train(stage, config.prior, config.seed, job.out, fingerprint)
+    policy.prior.eval().requires_grad_(False)
+    pool = ProposalPool.of(dataset, policy.prior, rng)
+    if job.stage == "aap":
+        policy.aap.requires_grad_(True)
+        oracle = None
+        # An AAP that has been trained has a z of its own, which a new oracle would only disturb.
+        if config.aap.training == "privileged" and "aap" not in policy.trained:
+            oracle = _train_oracle(job, config, policy, dataset, parts, fingerprint)
+        aap = AapStage(policy.aap, dataset, parts, config.aap, pool, oracle)
+        return train(aap, config.aap, config.seed, job.out, fingerprint)
+    policy.aip.requires_grad_(True)
+    frozen = FrozenAap.of(policy.aap, dataset, pool)
+    aip = AipStage(policy.aip, dataset, parts, config.aip, pool, frozen)
+    return train(aip, config.aip, config.seed, job.out, fingerprint)
+
+
+def _train_oracle(
+    job: StageJob, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split, fingerprint: str
+) -> OracleCritic:
+    """Train the oracle critic, save it, and start AAP from it."""
+    folder = job.out / "oracle"
+    folder.mkdir(exist_ok=True)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(torch_seed(config.seed, "learner.oracle") % 2**32)
+        critic = OracleCritic(copy.deepcopy(policy.aap))
+    settings = config.aap.model_copy(update={"steps": config.aap.oracle_steps})
+    train(OracleStage(critic, dataset, parts, config.aap), settings, config.seed, folder, fingerprint)
+    write_atomically(job.out / ORACLE_FILE, save({n: t.contiguous() for n, t in critic.state_dict().items()}))
+    for inherited in ("encoder", "action_encoder", "critic_head"):
+        getattr(policy.aap, inherited).load_state_dict(getattr(critic.aap, inherited).state_dict())
+    return critic
+
+
+def _fingerprint(job: StageJob, config: LearnerConfig, store: Store, policy: Policy) -> str:
+    """SHA-256 of all that the stage's result depends on."""
+    told = {
+        "stage": job.stage,
+        "config": config.model_dump(mode="json"),
+        "store": store.digest(),
+        "train": None if job.train_objects is None else sorted(job.train_objects),
+        "validation": None if job.validation_objects is None else sorted(job.validation_objects),
+    }
+    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    for _, data in sorted(policy.to_files().items()):
+        digest.update(data)
+    return digest.hexdigest()
+
+
+def _check_done(path: Path, fingerprint: str) -> None:
+    try:
+        found = json.loads(read_bounded(path, MAX_POLICY_JSON_BYTES))["fingerprint"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        found = None
+    if found != fingerprint:
+        raise UsageError(f"{path.parent}: holds a finished run with other data or settings; choose another --out")

@@ -1,0 +1,227 @@
+"""The training loop that all stages share: Adam, a decaying rate, validation, checkpoints and a line of progress.
+
+Every step draws its randomness from the seed, the stage's name and its own number, so that a run that was killed and
+resumed gives the same bits as one that was not (on one kind of CPU, with one number of threads).
+"""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor, nn
+
+from learner.checkpoint import Cursor, read_checkpoint, write_checkpoint
+from learner.configuration import TrainingConfig
+from shared.errors import UsageError
+from shared.seeds import generator
+
+METRICS_FILE = "metrics.jsonl"
+CHECKPOINT_FILE = "checkpoint.safetensors"
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterGroup:
+    """Parameters that learn at a common factor of the learning rate."""
+
+    parameters: tuple[nn.Parameter, ...]
+    rate: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """Losses of one step, which are summed, and how many interactions it saw."""
+
+    losses: Mapping[str, Tensor]
+    interactions: int
+
+
+class Stage(Protocol):
+    """What is trained, on what, and how it is judged."""
+
+    name: str
+    module: nn.Module
+    """Holds everything that is trained."""
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """What the optimiser may change."""
+        ...
+
+    def loss(self, rng: np.random.Generator) -> StepResult:
+        """The losses of one batch, drawn by `rng`."""
+        ...
+
+    def validate(self) -> dict[str, float]:
+        """Figures on objects not trained on; the lower "score", the better."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingResult:
+    """How a stage went; the module holds its best weights."""
+
+    steps: int
+    best_step: int
+    seconds: float
+    interactions: int
+    metrics: dict[str, float]
+    """Validation figures of the best weights."""
+
+
+def train(stage: Stage, config: TrainingConfig, seed: int, out: Path, fingerprint: str = "") -> TrainingResult:
+    """Train a stage, from its last checkpoint in `out` where there is one.
+
+    Args:
+        stage: what to train; its module ends up with the best weights.
+        config: how long, how fast.
+        seed: of all randomness.
+        out: an existing folder for the checkpoint and the metrics.
+        fingerprint: of everything that the result depends on; a checkpoint with another one is refused.
+
+    Raises:
+        UsageError: the checkpoint is of another run, or the loss is not finite.
+        StoreError: the checkpoint is damaged.
+    """
+    return _Loop(stage, config, seed, out, fingerprint).run()
+
+
+class _Loop:
+    """The state of one training run."""
+
+    def __init__(self, stage: Stage, config: TrainingConfig, seed: int, out: Path, fingerprint: str) -> None:
+        self.stage, self.config, self.seed, self.out = stage, config, seed, out
+        self.groups = [group for group in stage.parameter_groups() if group.parameters]
+        self.optimiser = torch.optim.Adam(
+            [{"params": list(group.parameters)} for group in self.groups],
+            lr=config.learning_rate,
+            weight_decay=config.weight_decay,
+        )
+        self.cursor = Cursor(fingerprint=fingerprint)
+        self.best = {name: tensor.clone() for name, tensor in stage.module.state_dict().items()}
+        self._resume()
+        self._saved_at = time.monotonic()
+
+    def run(self) -> TrainingResult:
+        """Step until the steps, the seconds or the patience are used up."""
+        console = Console(stderr=True)
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+        )
+        with Progress(*columns, TimeRemainingColumn(), console=console, disable=not sys.stderr.isatty()) as progress:
+            task = progress.add_task(self.stage.name, total=self.config.steps, rate="", completed=self.cursor.step)
+            while not self._finished():
+                self._step()
+                rate = self.cursor.interactions / max(self.cursor.seconds, 1e-9)
+                progress.update(task, completed=self.cursor.step, rate=f"{rate:,.0f} interactions/s")
+        self.stage.module.load_state_dict(self.best)
+        self.stage.module.eval()
+        cursor = self.cursor
+        return TrainingResult(cursor.step, cursor.best_step, cursor.seconds, cursor.interactions, cursor.best_metrics)
+
+    def _finished(self) -> bool:
+        spent = self.config.seconds is not None and self.cursor.seconds >= self.config.seconds
+        return self.cursor.step >= self.config.steps or spent or self.cursor.misses >= self.config.patience
+
+    def _step(self) -> None:
+        started = time.monotonic()
+        step = self.cursor.step
+        decayed = self.config.learning_rate * self.config.decay ** (step // self.config.decay_steps)
+        for group, options in zip(self.groups, self.optimiser.param_groups, strict=True):
+            options["lr"] = decayed * group.rate
+        self.stage.module.train()
+        result = self.stage.loss(generator(self.seed, f"learner.{self.stage.name}", step))
+        total = torch.stack(list(result.losses.values())).sum()
+        if not math.isfinite(total.item()):
+            raise UsageError(f"{self.stage.name}: the loss is not finite at step {step}; lower learning_rate")
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()  # type: ignore[no-untyped-call]
+        self.optimiser.step()
+        self.cursor = self.cursor.model_copy(
+            update={
+                "step": step + 1,
+                "interactions": self.cursor.interactions + result.interactions,
+                "seconds": self.cursor.seconds + time.monotonic() - started,
+            }
+        )
+        ended = self._finished()
+        if ended or self.cursor.step % self.config.validate_every == 0:
+            self._validate({name: float(loss.item()) for name, loss in result.losses.items()})
+        if ended or time.monotonic() - self._saved_at >= self.config.checkpoint_seconds:
+            self._save()
+
+    def _validate(self, losses: dict[str, float]) -> None:
+        started = time.monotonic()
+        self.stage.module.eval()
+        metrics = self.stage.validate()
+        better = metrics["score"] < self.cursor.best_score
+        if better:
+            self.best = {name: tensor.clone() for name, tensor in self.stage.module.state_dict().items()}
+        self.cursor = self.cursor.model_copy(
+            update={
+                "misses": 0 if better else self.cursor.misses + 1,
+                "best_score": metrics["score"] if better else self.cursor.best_score,
+                "best_step": self.cursor.step if better else self.cursor.best_step,
+                "best_metrics": metrics if better else self.cursor.best_metrics,
+            }
+        )
+        line: dict[str, Any] = {"stage": self.stage.name, "step": self.cursor.step}
+        line |= {f"loss_{name}": value for name, value in losses.items()} | metrics
+        line |= {
+            "training_seconds": round(self.cursor.seconds, 3),
+            "validation_seconds": round(time.monotonic() - started, 3),
+            "interactions_per_second": round(self.cursor.interactions / max(self.cursor.seconds, 1e-9), 1),
+        }
+        with (self.out / METRICS_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(without_nan(line)) + "\n")
+
+    def _save(self) -> None:
+        path = self.out / CHECKPOINT_FILE
+        write_checkpoint(path, self.cursor, self.stage.module, self.best, self.optimiser)
+        self._saved_at = time.monotonic()
+
+    def _resume(self) -> None:
+        path = self.out / CHECKPOINT_FILE
+        if not path.exists():
+            return
+        cursor, self.best = read_checkpoint(path, self.stage.module, self.optimiser)
+        if cursor.fingerprint != self.cursor.fingerprint:
+            raise UsageError(f"{self.out}: holds a run with other data or settings; choose another --out")
+        self.cursor = cursor
+        self._forget_metrics_after(cursor.step)
+
+    def _forget_metrics_after(self, step: int) -> None:
+        """Drop lines written after the checkpoint, which will be written again, and a line that a kill cut off."""
+        path = self.out / METRICS_FILE
+        if not path.exists():
+            return
+        kept = [line for line in map(_parsed, path.read_text(encoding="utf-8").splitlines()) if line is not None]
+        text = "".join(json.dumps(line) + "\n" for line in kept if line.get("step", 0) <= step)
+        temporary = path.with_suffix(".tmp")
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+
+
+def without_nan(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values with null for what is not a number, which JSON cannot say."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()
+    }
+
+
+def _parsed(line: str) -> dict[str, Any] | None:
+    try:
+        parsed = json.loads(line)
+    except json.JSONDecodeError:
+        return None
+    return parsed if isinstance(parsed, dict) else None
