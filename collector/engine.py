@@ -100,7 +100,7 @@ class Assembly:
         link.joint.type = joint
         link.joint.pose_in_parent = pose(np.eye(4) if parent_from_joint is None else parent_from_joint)
         link.joint.pose_in_child = pose(np.eye(4) if child_from_joint is None else child_from_joint)
-        # The engine's defaults resist motion by 0.05 of the joint's load and by air drag; ours is a drive of known limit.
+        # The engine's defaults add friction (0.05 of the load) and air drag; ours is a drive of known limit.
         link.joint.friction = 0.0
         link.linear_damping = link.angular_damping = 0.0
         if joint != "fixed":

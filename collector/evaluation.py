@@ -70,6 +70,8 @@ def evaluate(
     start = environment.state()
     try_from_one_state(recorder, RandomProposer(rng("queries")), config.queries, Role.QUERY)
     for name in config.methods:
+        if not recorder.sound:
+            return
         environment.restore(start)
         method = method_named(name)
         exploiter = make_proposer(method.exploits, rng(f"exploit/{name}"))
@@ -79,7 +81,6 @@ def evaluate(
         elif method.tries is not None:
             context = make_proposer(method.tries, rng(f"context/{name}"))
         _adapt(recorder, name, context, exploiter, sorted(config.budgets), clock)
-    environment.restore(start)
 
 
 def _adapt(
@@ -95,11 +96,12 @@ def _adapt(
     for budget in budgets:
         if context is not None:  # A proposer that has seen enough leaves the greater budgets with what there is.
             try_repeatedly(recorder, context, budget, Role.CONTEXT, history, method, clock)
-        observation = environment.observe()
-        if not observation.movable.any():
+        if not recorder.sound or not (observation := environment.observe()).movable.any():
             return
         state = environment.state()
         action = exploiter.propose(observation, history)
         assert action is not None, "an exploiter never stops"
         recorder.try_action(action, exploiter.name, Order.RESTART, Role.EXPLOIT, method, budget)
+        if not recorder.sound:
+            return
         environment.restore(state)

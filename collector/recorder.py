@@ -11,7 +11,7 @@ from collector.primitives import hand_start
 from collector.proposers import RandomProposer
 from shared.geometry import quaternion_from_rotation
 from shared.records import InteractionRecord
-from shared.vocabulary import Action, Interaction, Observation, Order, Proposer, Role
+from shared.vocabulary import Action, Interaction, Observation, Order, OutcomeKind, Proposer, Role
 
 
 @dataclass(slots=True)
@@ -61,6 +61,11 @@ class Recorder:
         )
         return Interaction(observation, action, outcome)
 
+    @property
+    def sound(self) -> bool:
+        """Whether the simulation has not diverged; nothing that follows could be believed."""
+        return not self.interactions or self.interactions[-1].outcome.kind is not OutcomeKind.UNSTABLE
+
     def _place_of(self, observation: Observation) -> int:
         """Where the observation is kept; a new one is added."""
         for place, kept in enumerate(self.observations):
@@ -90,7 +95,7 @@ def try_repeatedly(
         method: whose tries these are, in evaluation.
         clock: sums wall time by stage.
     """
-    while len(history) < most:
+    while recorder.sound and len(history) < most:
         observation = recorder.environment.observe()
         if not observation.movable.any():  # A part can swing out of the camera's sight.
             return
@@ -112,4 +117,6 @@ def try_from_one_state(recorder: Recorder, proposer: Proposer, count: int, role:
         if action is None:
             return
         recorder.try_action(action, proposer.name, Order.RESTART, role)
+        if not recorder.sound:
+            return
     environment.restore(state)

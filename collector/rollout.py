@@ -88,14 +88,15 @@ def collect(
         rng = seeds.generator(plan.setting.seed, f"policy/{plan.key}", index)
         most = min(rollout.context, rollout.interactions)
         try_repeatedly(recorder, make_proposer(plan.proposer, rng), most, Role.COLLECT, [], "", clock)
-        environment.restore(first)
+        if recorder.sound:
+            environment.restore(first)
     elif rollout.order is Order.CONTINUE:
         try_repeatedly(recorder, random, rollout.interactions, Role.COLLECT, [], "", clock)
-    while (left := rollout.interactions - len(recorder.interactions)) > 0:
+    while recorder.sound and (left := rollout.interactions - len(recorder.interactions)) > 0:
         one_state = environment.task.closed  # Every draw of a state would give the same one.
         before = len(recorder.interactions)
         try_from_one_state(recorder, random, left if one_state else min(left, rollout.actions_per_state), Role.COLLECT)
-        if one_state or not _next_state(environment, states):
+        if one_state or not recorder.sound or not _next_state(environment, states):
             break
         assert len(recorder.interactions) > before, "a state without targets is never used"
 

@@ -81,7 +81,7 @@ class DynamicsRanges(StrictModel):
 
     part_mass: Range = Range(low=0.05, high=0.5, log=True)
     joint_friction: Range = Range(low=0.05, high=2.0, log=True)
-    surface_friction: Range = Range(low=0.1, high=4.0, log=True)
+    surface_friction: Range = Range(low=0.2, high=10.0, log=True)
 
 
 class RolloutConfig(StrictModel):
