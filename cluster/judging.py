@@ -44,7 +44,7 @@ def judge(store: Store, version: int) -> list[dict[str, Any]]:
 
 
 def _each_budget(row: EvaluationRow, store: Store, budgets: list[int]) -> list[EvaluationRow]:
-    """The prior's row for each budget, to stand beside the others: tries change nothing but which actions were drawn."""
+    """The prior at each budget, to stand beside the others: only which actions were drawn differs."""
     table = store.interactions(["role", "method", "budget", "success"]).to_pylist()
     exploits = [r for r in table if r["role"] == Role.EXPLOIT.value and r["method"] == row.method]
     rows = []

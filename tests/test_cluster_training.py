@@ -74,9 +74,9 @@ def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> 
     driver = subprocess.Popen(
         [
             sys.executable,
-            "-c",
+            "-uc",
             "import pathlib; from cluster import training;"
-            f"training.run_child({STAND_IN!r}, ['hang'], pathlib.Path({str(tmp_path)!r}), lambda l: print(l, flush=True))",
+            f"training.run_child({STAND_IN!r}, ['hang'], pathlib.Path({str(tmp_path)!r}), print)",
         ],
         stdout=subprocess.PIPE,
     )
