@@ -100,24 +100,26 @@ class AapStage:
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Figures on objects not trained on, before and after the longest context; "score" is the cross entropy."""
+        """Figures on objects not trained on, before and after the longest context; "score" sums both losses."""
         rng = np.random.default_rng(_VALIDATION_SEED)
         rollouts = self.parts.validation[:VALIDATION_ROLLOUTS]
         scores: tuple[list[Tensor], list[Tensor]] = ([], [])
-        labels, losses = [], []
+        labels, losses, affordance = [], [], []
         for start in range(0, len(rollouts), _CHUNK):
             ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
             context = ordered.longest_context(self.config.context)
             prediction = predict(self.aap, self.dataset, ordered, context)
             success, asked = self.dataset.rows.success[ordered.rows], ordered.asked(context)
             losses.append(action_scoring_loss(prediction.logits, success[:, None], asked))
+            affordance.append(self._actionability_loss(ordered, prediction, rng))
             asked_last = asked[:, -1]
             for kept, prefix in zip(scores, (0, -1), strict=True):
                 kept.append(torch.sigmoid(prediction.logits[:, prefix][asked_last]))
             labels.append(success[asked_last])
         before, after = (discrimination(torch.cat(kept).numpy(), torch.cat(labels).numpy()) for kept in scores)
         return {
-            "score": float(torch.stack(losses).mean()),
+            "score": float(torch.stack(losses).mean() + torch.stack(affordance).mean()),
+            "affordance": float(torch.stack(affordance).mean()),
             "bce_without_tries": before.bce,
             "bce_with_tries": after.bce,
             "f_without_tries": before.f_score,

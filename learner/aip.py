@@ -117,17 +117,25 @@ class AipStage:
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Figures on objects not trained on; "score" is the critic's L1, "score_of_median" that of a constant."""
+        """Figures on objects not trained on; "score" sums both losses.
+
+        "critic" is to be compared with "critic_of_median", the loss of a constant.
+        """
         rng = np.random.default_rng(_VALIDATION_SEED)
         ordered = self._order(list(self.parts.validation[:VALIDATION_ROLLOUTS]), rng)
         found = self.gains(ordered)
-        predicted = self._predict(ordered, found, self.aip.encoder(self.dataset.clouds.select(ordered.clouds)))
+        encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
+        predicted = self._predict(ordered, found, encoded)
+        critic = float(information_loss(predicted, found.gains, found.mask))
+        affordance = float(self._actionability_loss(ordered, found, encoded, rng))
         gains, guesses = found.gains[found.mask], predicted[found.mask]
         together = torch.stack([gains, guesses])
         varied = len(gains) > 1 and bool((together.std(dim=1) > 0).all())
         return {
-            "score": float(information_loss(predicted, found.gains, found.mask)),
-            "score_of_median": float(masked_mean((found.gains - gains.median()).abs(), found.mask)),
+            "score": critic + affordance,
+            "critic": critic,
+            "affordance": affordance,
+            "critic_of_median": float(masked_mean((found.gains - gains.median()).abs(), found.mask)),
             "mean_gain": float(gains.mean()),
             "correlation": float(torch.corrcoef(together)[0, 1]) if varied else float("nan"),
         }

@@ -193,6 +193,7 @@ class _Loop:
     def _resume(self) -> None:
         path = self.out / CHECKPOINT_FILE
         if not path.exists():
+            self._forget_metrics_after(0)
             return
         cursor, self.best = read_checkpoint(path, self.stage.module, self.optimiser)
         if cursor.fingerprint != self.cursor.fingerprint:

@@ -1,0 +1,220 @@
+"""What the learner reads from a store, how it splits it, and how it measures."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learner.data import Dataset, load_dataset, split
+from learner.facts import FACTS_WIDTH, HiddenColumns, facts_of, fit_twists
+from learner.losses import (
+    action_scoring_loss,
+    distillation_loss,
+    information_gains,
+    masked_mean,
+    proposal_loss,
+    top_score,
+)
+from learner.metrics import area_under_roc, best_f_score, discrimination, f_score
+from learner.sampling import order_rows
+from shared.errors import StoreError, UsageError
+from shared.geometry import view_from_world
+from shared.networks.actions import orthonormal_frames
+from shared.plan import Job, Plan
+from shared.records import RolloutRecord
+from shared.store.store import Store
+from shared.vocabulary import OutcomeKind
+from tests.fabricate import fabricate_rollouts, fabricate_setting
+from tests.test_networks import TINY
+
+ROLLOUTS = 8
+
+
+def make_store(path: Path, rollouts: list[RolloutRecord] | None = None, plan: Plan | None = None) -> Store:
+    plan = plan or fabricated_plan()
+    rollouts = fabricated_rollouts(plan) if rollouts is None else rollouts
+    store = Store.create(path, plan.setting)
+    store.add_plan(plan)
+    store.commit(plan, Job(plan.key, 0, len(rollouts)), rollouts, {})
+    return store
+
+
+def fabricated_plan() -> Plan:
+    return Plan(setting=fabricate_setting(objects=4, points=64))
+
+
+def fabricated_rollouts(plan: Plan, count: int = ROLLOUTS) -> list[RolloutRecord]:
+    return fabricate_rollouts(plan, Job(plan.key, 0, count), interactions=12, per_observation=4)
+
+
+@pytest.fixture(scope="module")
+def records() -> list[RolloutRecord]:
+    return fabricated_rollouts(fabricated_plan())
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return load_dataset(make_store(tmp_path_factory.mktemp("data") / "store"), TINY)
+
+
+def test_every_cloud_is_there_once_and_every_row_in_the_view_frame(
+    dataset: Dataset, records: list[RolloutRecord]
+) -> None:
+    assert len(dataset.clouds.points) == sum(len(r.observations) for r in records)
+    assert len(dataset.rows) == sum(len(r.interactions) for r in records)
+    for rollout, index in zip(records, dataset.rollouts, strict=True):
+        for interaction, row in zip(rollout.interactions, index.tolist(), strict=True):
+            view = view_from_world(rollout.observations[interaction.observation].world_from_camera)
+            cloud = dataset.clouds.points[dataset.rows.cloud[row]]
+            assert torch.equal(cloud[dataset.rows.point[row]], dataset.rows.xyz[row])
+            np.testing.assert_allclose(dataset.rows.xyz[row], view @ interaction.action.point, atol=1e-6)
+            expected = np.concatenate([view @ interaction.action.approach, view @ interaction.action.forward])
+            np.testing.assert_allclose(dataset.rows.frame[row], expected, atol=1e-6)
+            assert bool(dataset.rows.success[row]) == interaction.outcome.success
+
+
+def test_failed_infrastructure_is_no_label(tmp_path: Path, records: list[RolloutRecord]) -> None:
+    first = records[0].interactions[0]
+    lost = dataclasses.replace(first.outcome, kind=OutcomeKind.ABANDONED, success=False, motion=0.0)
+    kept = (dataclasses.replace(first, outcome=lost), *records[0].interactions[1:])
+    changed = [dataclasses.replace(records[0], interactions=kept), *records[1:]]
+    loaded = load_dataset(make_store(tmp_path / "store", changed), TINY)
+    assert len(loaded.rollouts[0]) == len(records[0].interactions) - 1
+    assert int(loaded.rows.step[loaded.rollouts[0]].min()) == 1
+
+
+def test_an_empty_store_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="no interaction to learn from"):
+        load_dataset(Store.create(tmp_path / "store", fabricate_setting(points=64)), TINY)
+
+
+def test_no_object_is_on_both_sides(dataset: Dataset) -> None:
+    parts = split(dataset, None, None)
+    sides = [{dataset.objects[k] for k in side} for side in (parts.train, parts.validation)]
+    assert sides[0]
+    assert sides[1]
+    assert not sides[0] & sides[1]
+    assert sides[0] | sides[1] == set(dataset.objects)
+    assert split(dataset, {"object-1"}, {"object-2"}).train == dataset.rollouts_of({"object-1"})
+    with pytest.raises(UsageError, match="object-1"):
+        split(dataset, {"object-1", "object-2"}, {"object-1"})
+    with pytest.raises(UsageError, match="for validation"):
+        split(dataset, {"object-1"}, {"unheard-of"})
+
+
+@given(st.integers(0, 10_000), st.integers(1, 14), st.integers(0, 9))
+@settings(max_examples=40, deadline=None)
+def test_context_and_questions_never_overlap(dataset: Dataset, seed: int, size: int, limit: int) -> None:
+    ordered = order_rows(dataset, [0, 3, 3, 5], size, np.random.default_rng(seed))
+    context = ordered.longest_context(limit)
+    asked = ordered.asked(context)
+    for number, rollout in enumerate([0, 3, 3, 5]):
+        rows = ordered.rows[number][ordered.valid[number]].tolist()
+        assert len(set(rows)) == len(rows) == min(size, 12)
+        assert set(rows) <= set(dataset.rollouts[rollout].tolist())
+        for prefix in range(context + 1):
+            questions = ordered.rows[number][asked[number, prefix]].tolist()
+            assert not set(questions) & set(rows[:prefix])
+            assert set(questions) | set(rows[:prefix]) == set(rows)
+    assert torch.equal(ordered.clouds[ordered.cloud], dataset.rows.cloud[ordered.rows])
+
+
+def test_proposed_tries_come_first_in_their_own_order(dataset: Dataset) -> None:
+    proposed = torch.zeros(len(dataset.rows), dtype=torch.bool)
+    tries = dataset.rollouts[2][[1, 5, 7]]
+    proposed[tries] = True
+    marked = dataclasses.replace(dataset, rows=dataclasses.replace(dataset.rows, proposed=proposed))
+    ordered = order_rows(marked, [2], 12, np.random.default_rng(0), proposed_first=1.0)
+    assert ordered.rows[0, :3].tolist() == tries.tolist()
+    assert sorted(ordered.rows[0].tolist()) == sorted(dataset.rollouts[2].tolist())
+
+
+def turned(points: np.ndarray, axis: np.ndarray, through: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Displacements of points that turn about an axis (Rodrigues)."""
+    arm = points - through
+    cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
+    return arm * cos + np.cross(axis, arm) * sin + axis * (arm @ axis)[:, None] * (1 - cos) - arm
+
+
+def hidden_of(points: np.ndarray, displacements: np.ndarray, motions: np.ndarray) -> HiddenColumns:
+    count = len(points)
+    return HiddenColumns(
+        part=[("door", 1)] * count,
+        point=points,
+        displacement=displacements,
+        motion=motions,
+        room=np.tile([np.inf, 0.0], (count, 1)),
+        dynamics=np.ones((count, 3)),
+        direction=["clockwise"] * count,
+        view=np.tile(np.eye(3), (count, 1, 1)),
+    )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("side", [-0.4, 0.4])
+def test_the_twist_tells_a_hinges_side_and_sign(side: float, sign: float) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-0.5, -0.4, -0.5], [-0.4, 0.4, 0.5], (30, 3))
+    axis, through = np.array([0, 0, sign]), np.array([-0.45, side, 0.0])
+    motions = rng.uniform(0.05, 0.4, 30)
+    w, v = fit_twists(hidden_of(points, turned(points, axis, through, motions), motions))["door", 1].reshape(2, 3)
+    np.testing.assert_allclose(w, axis, atol=0.05)
+    np.testing.assert_allclose(v, np.cross(through, axis), atol=0.05)
+
+
+def test_facts_of_a_part_that_never_moved_say_so() -> None:
+    hidden = hidden_of(np.ones((2, 3)), np.full((2, 3), np.nan), np.zeros(2))
+    facts = facts_of(hidden)
+    assert facts.shape == (2, FACTS_WIDTH)
+    assert np.isfinite(facts).all()
+    assert (facts[:, -7:] == 0).all()
+
+
+def test_metrics_of_an_example_worked_by_hand() -> None:
+    scores, labels = [0.9, 0.6, 0.4, 0.2], [True, False, True, False]
+    found = discrimination(scores, labels)
+    assert found.f_score == pytest.approx(2 * 1 / (2 + 2))  # One hit, two claims, two successes.
+    assert found.best_f_score == pytest.approx(2 * 2 / (3 + 2))  # At 0.4: two hits, three claims.
+    assert found.auc == pytest.approx(3 / 4)  # Of four pairs, only (0.4, 0.6) is the wrong way round.
+    assert found.bce == pytest.approx(-np.mean(np.log([0.9, 0.4, 0.4, 0.8])))
+    assert (found.base_rate, found.rows) == (0.5, 4)
+
+
+def test_metrics_know_what_is_not_defined() -> None:
+    nothing = discrimination([], [])
+    assert np.isnan([nothing.f_score, nothing.best_f_score, nothing.bce, nothing.auc, nothing.base_rate]).all()
+    assert np.isnan(area_under_roc(np.array([0.1, 0.2]), np.array([True, True])))
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.booleans()), min_size=2, max_size=20))
+@settings(max_examples=60, deadline=None)
+def test_metrics_agree_with_trying_everything(rows: list[tuple[int, bool]]) -> None:
+    scores, labels = np.array([s / 4 for s, _ in rows]), np.array([r for _, r in rows])
+    if labels.any():
+        best = max(f_score(scores >= threshold, labels) for threshold in set(scores))
+        assert best_f_score(scores, labels) == pytest.approx(best)
+    if labels.any() and not labels.all():
+        pairs = [(a > b) + 0.5 * (a == b) for a in scores[labels] for b in scores[~labels]]
+        assert area_under_roc(scores, labels) == pytest.approx(np.mean(pairs))
+
+
+def test_losses_of_examples_worked_by_hand() -> None:
+    logits = torch.tensor([[0.0, 2.0]])
+    mask = torch.tensor([[True, False]])
+    assert action_scoring_loss(logits, torch.ones(1, 2), mask).item() == pytest.approx(np.log(2))
+    assert information_gains(torch.tensor([0.9, 0.5, 0.6])).tolist() == pytest.approx([0.4, -0.1])
+    assert top_score(torch.tensor([[0.1, 0.9, 0.5]]), 2).item() == pytest.approx(0.7)
+    assert masked_mean(torch.tensor([np.nan, 2.0]), torch.tensor([False, True])).item() == 2.0
+    assert masked_mean(torch.ones(2), torch.zeros(2, dtype=torch.bool)).item() == 0.0
+    same = torch.randn(3, 1, 4)
+    assert distillation_loss(same.expand(3, 2, 4), same[:, 0], torch.ones(3, 2, dtype=torch.bool)).item() == 0.0
+
+
+def test_the_proposal_loss_is_that_of_the_best_draw() -> None:
+    draws = orthonormal_frames(torch.randn(2, 5, 6, generator=torch.Generator().manual_seed(0)))
+    assert proposal_loss(draws, draws[:, 3]).item() == pytest.approx(0.0, abs=3e-3)
+    assert proposal_loss(draws[:0], draws[:0, 0]).item() == 0.0

@@ -1,0 +1,363 @@
+"""Training: each loss can be driven down, reaches what it should and nothing else, and survives a kill."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from learner.__main__ import main
+from learner.aap import AapStage, OracleStage, predict
+from learner.aip import AipStage, FrozenAap
+from learner.checkpoint import Cursor
+from learner.configuration import AapConfig, AipConfig, LearnerConfig, PriorConfig, TrainingConfig
+from learner.data import Dataset, Split, load_dataset
+from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
+from learner.oracle import OracleCritic
+from learner.prior import PriorStage
+from learner.sampling import ProposalPool, order_rows
+from learner.stages import DONE_FILE, StageJob, read_policy_folder, run_stage
+from learner.training import METRICS_FILE, Stage, StepResult, train
+from shared.errors import UsageError
+from shared.policy import WEIGHTS_FILE, Policy
+from shared.records import InteractionRecord, RolloutRecord
+from shared.vocabulary import Role
+from tests.test_learner_data import fabricated_plan, fabricated_rollouts, make_store
+from tests.test_networks import TINY
+
+FAST = LearnerConfig(
+    network=TINY,
+    prior=PriorConfig(steps=4, validate_every=2, proposals=10),
+    aap=AapConfig(steps=4, validate_every=2, proposals=10, context=4, oracle_steps=4),
+    aip=AipConfig(steps=4, validate_every=2, proposals=10),
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("learner")
+
+
+@pytest.fixture(scope="module")
+def dataset(folder: Path) -> Dataset:
+    return load_dataset(make_store(folder / "store"), TINY)
+
+
+@pytest.fixture(scope="module")
+def coin_dataset(dataset: Dataset) -> Dataset:
+    """All tries of a rollout succeed, or none does: only a try tells which."""
+    success = torch.zeros(len(dataset.rows))
+    for number, rows in enumerate(dataset.rollouts):
+        success[rows] = float(number % 2)
+    rows = dataclasses.replace(dataset.rows, success=success, motion=success * 0.3)
+    facts = torch.zeros_like(rows.facts)
+    facts[:, 0] = success
+    return dataclasses.replace(dataset, rows=dataclasses.replace(rows, facts=facts))
+
+
+EVERYTHING = Split(tuple(range(8)), tuple(range(8)))
+
+
+def fresh(dataset: Dataset, seed: int = 0) -> tuple[Policy, ProposalPool]:
+    policy = Policy.untrained("push", TINY, seed)
+    return policy, ProposalPool.of(dataset, policy.prior, np.random.default_rng(0))
+
+
+def descend(stage: Stage, steps: int, rate: float = 5e-3) -> tuple[dict[str, float], dict[str, float]]:
+    """Losses of one fixed batch before and after some steps on it."""
+    groups = [{"params": list(group.parameters)} for group in stage.parameter_groups()]
+    optimiser = torch.optim.Adam(groups, lr=rate)
+    history = []
+    for _ in range(steps):
+        losses = stage.loss(np.random.default_rng(7)).losses
+        history.append({name: float(loss.detach()) for name, loss in losses.items()})
+        optimiser.zero_grad()
+        torch.stack(list(losses.values())).sum().backward()
+        optimiser.step()
+    return history[0], history[-1]
+
+
+def test_each_loss_of_the_prior_can_be_driven_down(dataset: Dataset) -> None:
+    policy, _ = fresh(dataset)
+    config = PriorConfig(proposals=20, batch_clouds=3)
+    before, after = descend(PriorStage(policy.prior, dataset, EVERYTHING, config), 80)
+    assert after["critic"] < 0.3 * before["critic"]
+    assert after["proposal"] < 0.5 * before["proposal"]
+    assert after["affordance"] < 0.25
+
+
+def test_aap_learns_to_read_a_try(coin_dataset: Dataset) -> None:
+    policy, pool = fresh(coin_dataset)
+    stage = AapStage(policy.aap, coin_dataset, EVERYTHING, AapConfig(context=4, batch_rollouts=8, proposals=10), pool)
+    descend(stage, 80)
+    figures = stage.validate()
+    assert figures["bce_with_tries"] < 0.25
+    assert figures["f_with_tries"] > 0.9
+    # Without a try the coin may only be guessed, unless the cloud is learnt by heart.
+    assert figures["bce_without_tries"] > 2 * figures["bce_with_tries"]
+    assert figures["affordance"] < 0.3
+
+
+def test_the_oracle_knows_and_aap_learns_from_it(coin_dataset: Dataset) -> None:
+    policy, pool = fresh(coin_dataset)
+    critic = OracleCritic(policy.aap)
+    config = AapConfig(training="privileged", context=4, batch_rollouts=8, proposals=10)
+    oracle_stage = OracleStage(critic, coin_dataset, EVERYTHING, config)
+    descend(oracle_stage, 60)
+    assert oracle_stage.validate()["f_score"] > 0.95
+    student, _ = fresh(coin_dataset, 1)
+    stage = AapStage(student.aap, coin_dataset, EVERYTHING, config, pool, critic)
+    before, after = descend(stage, 40)
+    assert after["distillation"] < 0.5 * before["distillation"]
+
+
+def test_each_loss_of_aip_can_be_driven_down(coin_dataset: Dataset) -> None:
+    policy, pool = fresh(coin_dataset)
+    config = AapConfig(context=4, batch_rollouts=8, proposals=10)
+    descend(AapStage(policy.aap, coin_dataset, EVERYTHING, config, pool), 40)
+    frozen = FrozenAap.of(policy.aap, coin_dataset, pool)
+    stage = AipStage(policy.aip, coin_dataset, EVERYTHING, AipConfig(draws=2, proposals=10), pool, frozen)
+    before, after = descend(stage, 100)
+    # What a try will say is a coin itself, so that only the mean gain at each step can be learnt.
+    assert after["critic"] < 0.75 * before["critic"]
+    assert after["affordance"] < before["affordance"] + 0.01
+    figures = stage.validate()
+    assert figures["mean_gain"] > 0.01
+    assert figures["critic"] < figures["critic_of_median"]
+
+
+def test_gains_are_differences_of_the_loss_on_the_same_rows(coin_dataset: Dataset) -> None:
+    policy, pool = fresh(coin_dataset)
+    frozen = FrozenAap.of(policy.aap, coin_dataset, pool)
+    stage = AipStage(policy.aip, coin_dataset, EVERYTHING, AipConfig(context=3), pool, frozen)
+    ordered = order_rows(coin_dataset, [0, 1], 12, np.random.default_rng(0))
+    found = stage.gains(ordered)
+    with torch.no_grad():
+        logits = predict(policy.aap, coin_dataset, ordered, 3).logits
+    success = coin_dataset.rows.success[ordered.rows][:, None].expand_as(logits)
+    losses = nn.functional.binary_cross_entropy_with_logits(logits, success, reduction="none")[..., 3:].mean(-1)
+    torch.testing.assert_close(found.gains, losses[:, :-1] - losses[:, 1:], rtol=1e-3, atol=1e-5)
+    for k in range(3):
+        torch.testing.assert_close(found.scores[:, k], torch.sigmoid(logits[:, k, k]), rtol=1e-3, atol=1e-5)
+
+
+def reached(stage: Stage, whole: nn.Module) -> set[str]:
+    """Top-level parts of a module that a stage's loss sends a gradient to."""
+    whole.zero_grad()
+    torch.stack(list(stage.loss(np.random.default_rng(0)).losses.values())).sum().backward()
+    return {name.split(".")[1] for name, p in whole.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
+
+
+def test_gradients_reach_their_own_module_and_no_other(dataset: Dataset) -> None:
+    policy, pool = fresh(dataset)
+    whole = nn.ModuleDict({"aap": policy.aap, "prior": policy.prior, "aip": policy.aip})
+    stages = {
+        "prior": PriorStage(policy.prior, dataset, EVERYTHING, PriorConfig(proposals=5)),
+        "aap": AapStage(policy.aap, dataset, EVERYTHING, AapConfig(proposals=5), pool),
+    }
+    for name, stage in stages.items():
+        policy.prior.requires_grad_(name == "prior")
+        assert reached(stage, whole) == {child for child, _ in getattr(policy, name).named_children()} | (
+            {"empty_latent"} if name == "aap" else set()
+        )
+        others = [p for key, p in whole.named_parameters() if not key.startswith(name)]
+        assert all(p.grad is None for p in others)
+    before = {name: tensor.clone() for name, tensor in policy.aap.state_dict().items()}
+    frozen = FrozenAap.of(policy.aap, dataset, pool)
+    aip = AipStage(policy.aip, dataset, EVERYTHING, AipConfig(proposals=5), pool, frozen)
+    assert reached(aip, whole) == {child for child, _ in policy.aip.named_children()}
+    descend(aip, 3)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in policy.aap.state_dict().items())
+    assert all(p.grad is None for p in policy.aap.parameters())
+
+
+class KilledError(Exception):
+    """Stands for a kill."""
+
+
+class Killed:
+    """A stage that dies after some steps."""
+
+    def __init__(self, stage: Stage, after: int) -> None:
+        self.stage, self.left = stage, after
+        self.name, self.module = stage.name, stage.module
+        self.parameter_groups, self.validate = stage.parameter_groups, stage.validate
+
+    def loss(self, rng: np.random.Generator) -> StepResult:
+        self.left -= 1
+        if self.left < 0:
+            raise KilledError
+        return self.stage.loss(rng)
+
+
+@pytest.mark.parametrize("kills", [[5], [1, 1, 6], [0, 3]])
+def test_a_killed_run_ends_with_the_bits_of_one_that_was_not(
+    dataset: Dataset, tmp_path: Path, kills: list[int]
+) -> None:
+    config = TrainingConfig(steps=9, validate_every=2, checkpoint_seconds=0.0, decay_steps=3)
+    results, weights, lines = [], [], []
+    for name, deaths in (("whole", []), ("killed", kills)):
+        out = tmp_path / name
+        out.mkdir()
+        for after in [*deaths, 10**6]:
+            policy, pool = fresh(dataset)
+            stage = AapStage(policy.aap, dataset, EVERYTHING, AapConfig(proposals=5, context=3), pool)
+            try:
+                results.append(train(Killed(stage, after), config, 3, out))
+            except KilledError:
+                with (out / METRICS_FILE).open("a", encoding="utf-8") as file:
+                    file.write('{"step": 99')
+                continue
+            weights.append(policy.to_files()[WEIGHTS_FILE])
+        timeless = [json.loads(line) for line in (out / METRICS_FILE).read_text().splitlines()]
+        lines.append([{k: v for k, v in line.items() if "second" not in k} for line in timeless])
+    assert weights[0] == weights[1]
+    assert lines[0] == lines[1]
+    assert [dataclasses.replace(r, seconds=0.0) for r in results[:1]] == [
+        dataclasses.replace(r, seconds=0.0) for r in results[1:]
+    ]
+
+
+def test_the_best_weights_are_kept_and_patience_ends_a_run(tmp_path: Path) -> None:
+    class Wandering:
+        name = "wandering"
+
+        def __init__(self) -> None:
+            self.module: nn.Module = nn.Linear(1, 1)
+            self.scores = iter([3.0, 1.0, 2.0, 2.0, 2.0, 0.0])
+            self.at_best: torch.Tensor | None = None
+
+        def parameter_groups(self) -> list[object]:
+            from learner.training import ParameterGroup
+
+            return [ParameterGroup(tuple(self.module.parameters()))]
+
+        def loss(self, rng: np.random.Generator) -> StepResult:
+            return StepResult({"x": self.module(torch.ones(1)).sum()}, 1)
+
+        def validate(self) -> dict[str, float]:
+            score = next(self.scores)
+            if score == 1.0:
+                self.at_best = next(self.module.parameters()).detach().clone()
+            return {"score": score}
+
+    stage = Wandering()
+    result = train(stage, TrainingConfig(steps=100, validate_every=1, patience=3), 0, tmp_path)  # type: ignore[arg-type]
+    assert (result.steps, result.best_step, result.metrics) == (5, 2, {"score": 1.0})
+    assert stage.at_best is not None
+    assert torch.equal(next(stage.module.parameters()), stage.at_best)
+
+
+def test_a_cursor_survives_what_json_cannot_say() -> None:
+    cursor = Cursor(best_metrics={"f": float("nan")}, step=3)
+    assert np.isnan(Cursor.model_validate_json(cursor.model_dump_json()).best_metrics["f"])
+
+
+@pytest.fixture(scope="module")
+def trained(folder: Path, dataset: Dataset) -> Path:
+    """Folders of all three stages, privileged AAP included."""
+    privileged = FAST.model_copy(update={"aap": FAST.aap.model_copy(update={"training": "privileged"})})
+    run_stage(StageJob("prior", folder / "store", folder / "prior"), FAST)
+    run_stage(StageJob("aap", folder / "store", folder / "aap", folder / "prior"), privileged)
+    run_stage(StageJob("aip", folder / "store", folder / "aip", folder / "aap"), FAST)
+    return folder
+
+
+def test_the_stages_end_in_a_policy_with_all_three_modules(trained: Path) -> None:
+    policy = read_policy_folder(trained / "aip")
+    assert policy.trained == {"prior", "aap", "aip"}
+    assert (trained / "aap" / "oracle.safetensors").is_file()
+    assert json.loads((trained / "aip" / DONE_FILE).read_text())["steps"] == 4
+    before, after = (read_policy_folder(trained / name).modules().state_dict() for name in ("aap", "aip"))
+    changed = {name.split(".")[0] for name, tensor in before.items() if not torch.equal(tensor, after[name])}
+    assert changed <= {"aip"}
+
+
+def test_a_finished_stage_is_not_run_again(trained: Path) -> None:
+    stamp = (trained / "prior" / WEIGHTS_FILE).stat().st_mtime_ns
+    run_stage(StageJob("prior", trained / "store", trained / "prior"), FAST)
+    assert (trained / "prior" / WEIGHTS_FILE).stat().st_mtime_ns == stamp
+    with pytest.raises(UsageError, match="other data or settings"):
+        run_stage(StageJob("prior", trained / "store", trained / "prior"), FAST.model_copy(update={"seed": 1}))
+
+
+def test_a_checkpoint_of_another_run_is_refused(trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained / "prior", tmp_path / "out")
+    (tmp_path / "out" / DONE_FILE).unlink()
+    (tmp_path / "out" / "checkpoint.safetensors").write_bytes(b"not one")
+    assert main(["prior", "--store", str(trained / "store"), "--out", str(tmp_path / "out")]) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["prior", "--store", "NOWHERE", "--out", "x"], "NOWHERE"),
+        (["aap", "--store", "STORE", "--out", "x"], "--init"),
+        (["aap", "--store", "STORE", "--out", "x", "--init", "NOWHERE"], "policy.json"),
+        (["prior", "--store", "STORE", "--out", "x", "--train-objects", "NOWHERE"], "NOWHERE"),
+        (["prior", "--store", "STORE", "--out", "x", "--config", "NOWHERE"], "NOWHERE"),
+        (["aip", "--store", "STORE", "--out", "x", "--init", "PRIOR"], "aap is not trained"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    places = {"STORE": str(trained / "store"), "PRIOR": str(trained / "prior")}
+    assert main([places.get(argument, argument) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_misspelt_setting_is_named(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.toml").write_text("[prior]\nlearning_rat = 1.0\n")
+    arguments = ["prior", "--store", str(trained / "store"), "--out", str(tmp_path / "x")]
+    assert main([*arguments, "--config", str(tmp_path / "c.toml")]) == 2
+    assert "did you mean 'learning_rate'" in capsys.readouterr().err
+
+
+def as_evaluation(rollout: RolloutRecord) -> RolloutRecord:
+    """Six queries, then two tries and one exploit of each of two methods."""
+    labels = [("", Role.QUERY, -1)] * 6
+    for method in ("ours-final", "ours-random"):
+        labels += [(method, Role.CONTEXT, -1)] * 2 + [(method, Role.EXPLOIT, 2)]
+
+    def labelled(interaction: InteractionRecord, method: str, role: Role, budget: int) -> InteractionRecord:
+        return dataclasses.replace(interaction, method=method, role=role, budget=budget)
+
+    rows = [labelled(i, *label) for i, label in zip(rollout.interactions, labels, strict=True)]
+    return dataclasses.replace(rollout, interactions=tuple(rows))
+
+
+def test_the_table_counts_what_was_tried(trained: Path, tmp_path: Path) -> None:
+    plan = fabricated_plan()
+    rollouts = [as_evaluation(rollout) for rollout in fabricated_rollouts(plan)]
+    store = make_store(tmp_path / "store", rollouts, plan)
+    policy = read_policy_folder(trained / "aip")
+    data = load_dataset(store, TINY)
+    table = {(row.method, row.budget): row for row in evaluate(data, policy, (1, 2))}
+    assert list(table) == [
+        (PRIOR_METHOD, 0),
+        (NO_TRIES_METHOD, 0),
+        *((method, budget) for method in ("ours-final", "ours-random") for budget in (1, 2)),
+    ]
+    queries = [i.outcome.success for r in rollouts for i in r.interactions if i.role is Role.QUERY]
+    for (method, budget), row in table.items():
+        assert row.queries == len(queries)
+        assert row.base_rate == pytest.approx(np.mean(queries))
+        exploits = [i.outcome.success for r in rollouts for i in r.interactions if (i.method, i.budget) == (method, 2)]
+        assert row.trials == (len(exploits) if budget == 2 else 0)
+        if budget == 2:
+            assert row.sample_success == pytest.approx(np.mean(exploits))
+        assert row.mean_tries == budget
+    assert table["ours-final", 1].bce != table["ours-final", 2].bce != table[NO_TRIES_METHOD, 0].bce
