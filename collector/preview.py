@@ -1,6 +1,7 @@
 """Contact sheets: many objects in one picture, each movable part in a colour of its own."""
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 import matplotlib
@@ -13,11 +14,12 @@ from collector.articulation import ArticulatedObject
 from collector.camera import EmbreeCamera
 from shared.configuration import CameraConfig
 from shared.errors import UsageError
+from shared.files import write_atomically
 from shared.geometry import camera_pose
 from shared.vocabulary import Float
 
 BODY_COLOUR = (0.62, 0.62, 0.62)
-AMBIENT = 0.35
+AMBIENT = 0.5
 """Share of a colour that shows where no light falls."""
 LIGHT_FROM = (-0.6, 0.45, 0.66)
 """Unit direction towards the light, world."""
@@ -55,9 +57,11 @@ def contact_sheet(
         axes.imshow(picture(target, openness, azimuth_deg, image_size))
         axes.set_title(f"{target.ref.id}\n{target.ref.category}", fontsize=7, y=-0.12)
     figure.subplots_adjust(left=0.0, right=1.0, bottom=0.04, top=1.0, wspace=0.02, hspace=0.16)
+    image = BytesIO()
+    figure.savefig(image, format="png")
     try:
         out_png.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out_png, format="png")
+        write_atomically(out_png, image.getvalue())
     except OSError as error:
         raise UsageError(f"{out_png}: cannot be written ({error.strerror}); name a .png file that can") from None
 

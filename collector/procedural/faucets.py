@@ -29,7 +29,7 @@ def random_faucet(rng: np.random.Generator) -> Assembly:
     heading = 0.0 if twin or rng.random() < 0.5 else np.pi
     switches = [_switch(str(style), stand, size, heading, upper, rng) for stand in stands]
     if twin and rng.random() < 0.4:
-        turning = Part("spout", "revolute", spout, (0.0, 0.0, height), TOP, np.pi / 2, -np.pi / 2)
+        turning = Part("spout", "revolute", spout, (0.0, 0.0, height), TOP, np.pi / 2)
         return Assembly("Faucet", "faucet_base", body, (*switches, turning))
     return Assembly("Faucet", "faucet_base", body + spout, tuple(switches))
 

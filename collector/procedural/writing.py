@@ -1,8 +1,6 @@
 """Writes assemblies as folders in PartNet-Mobility's layout."""
 
 import json
-import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -14,6 +12,7 @@ from collector.procedural.assembly import Assembly, Part
 from collector.procedural.catalogue import CATEGORIES, build
 from collector.procedural.shapes import Pieces, Point
 from shared.errors import UsageError
+from shared.files import TEMPORARY_PREFIX, remove_if_abandoned, remove_tree, temporary_name
 
 MESH_FOLDER = "textured_objs"
 _MOTION_WORDS = {"revolute": "hinge", "prismatic": "slider"}
@@ -43,6 +42,8 @@ def generate(out: Path, counts: Mapping[str, int], seed: int) -> list[Path]:
         raise UsageError(f"seed and counts must not be negative; given seed {seed}, counts {dict(counts)}")
     try:
         out.mkdir(parents=True, exist_ok=True)
+        for remnant in out.glob(f"{TEMPORARY_PREFIX}*"):
+            remove_if_abandoned(remnant)
         return [
             _write_folder(out / f"{category.lower()}-{index:04d}", object_files(build(category, seed, index)))
             for category, count in counts.items()
@@ -148,12 +149,11 @@ def _write_folder(folder: Path, files: Mapping[str, str]) -> Path:
             return folder
         raise UsageError(f"{folder}: holds another object; name another folder, or the seed that it was made with")
     # Readers pass over hidden folders, so a kill leaves nothing that could be taken for an object.
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    partial = folder.parent / temporary_name(folder.name)
     try:
-        (partial / MESH_FOLDER).mkdir()
+        (partial / MESH_FOLDER).mkdir(parents=True)
         for name, text in files.items():
             (partial / name).write_text(text, encoding="utf-8", newline="\n")
-        partial.chmod(0o755)
         try:
             partial.rename(folder)
         except OSError:
@@ -161,7 +161,7 @@ def _write_folder(folder: Path, files: Mapping[str, str]) -> Path:
             if not _holds(folder, files):
                 raise
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_tree(partial)
     return folder
 
 

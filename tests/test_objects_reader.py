@@ -1,0 +1,379 @@
+"""The reader: laws of a merged object, and one line for everything that a folder from outside may hold."""
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from collector import meshes, urdf
+from collector.files import ObjectFiles
+from collector.partnet import read_object
+from shared.errors import ObjectError
+
+CUBE_OBJ = (
+    "# a cube\nmtllib none.mtl\no cube\n"
+    + "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
+    + "vn 0 0 1\nusemtl red\ns off\n"
+    + "f 1//1 2//1 4//1 3//1\nf 5//1 7//1 8//1 6//1\nf 1//1 5//1 6//1 2//1\n"
+    + "f 3//1 4//1 8//1 7//1\nf 1//1 3//1 7//1 5//1\nf 2//1 6//1 8//1 4//1\n"
+)
+
+URDF = """<?xml version="1.0"?>
+<robot name="test">
+  <link name="base"/>
+  <link name="body">
+    <visual><geometry><mesh filename="textured_objs/cube.obj" scale="2 2 2"/></geometry></visual>
+    <collision><geometry><box size="2 2 2"/></geometry></collision>
+  </link>
+  <link name="door">
+    <visual><origin xyz="-1 0 0"/><geometry><mesh filename="textured_objs/cube.obj"/></geometry></visual>
+  </link>
+  <link name="handle">
+    <visual><geometry><cylinder radius="0.1" length="1"/></geometry></visual>
+    <collision><geometry><sphere radius="0.5"/></geometry></collision>
+  </link>
+  <link name="lock"><visual><geometry><sphere radius="0.1"/></geometry></visual></link>
+  <joint name="fixed" type="fixed"><origin rpy="1.5707963267948966 0 -1.5707963267948966" xyz="0 0 1"/>
+    <parent link="base"/><child link="body"/></joint>
+  <joint name="hinge" type="revolute"><origin xyz="0.5 0.25 0"/><axis xyz="0 0.1 0"/>
+    <parent link="body"/><child link="door"/><limit lower="0" upper="1.5"/></joint>
+  <joint name="weld" type="fixed"><origin xyz="0 0 0.5"/><parent link="door"/><child link="handle"/></joint>
+  <joint name="turn" type="continuous"><origin xyz="0 1 0"/><axis xyz="1 0 0"/>
+    <parent link="handle"/><child link="lock"/></joint>
+</robot>
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A well-formed object: a body, a door with a welded handle, and a lock on the handle."""
+    made = tmp_path / "cabinet-1"
+    (made / "textured_objs").mkdir(parents=True)
+    (made / "textured_objs/cube.obj").write_text(CUBE_OBJ)
+    (made / "mobility.urdf").write_text(URDF)
+    (made / "meta.json").write_text(json.dumps({"model_cat": "StorageFurniture"}))
+    (made / "semantics.txt").write_text("door hinge rotation_door\nbody heavy furniture_body\nlock hinge knob\n")
+    return made
+
+
+def edit(folder: Path, old: str, new: str, name: str = "mobility.urdf") -> None:
+    text = (folder / name).read_text()
+    assert old in text
+    (folder / name).write_text(text.replace(old, new))
+
+
+def test_fixed_links_become_one_body(folder: Path) -> None:
+    described = read_object(folder)
+    assert [body.link for body in described.bodies] == ["base", "door", "lock"]
+    assert [body.part_name for body in described.bodies] == ["furniture_body", "rotation_door", "knob"]
+    assert [len(body.visuals) for body in described.bodies] == [1, 2, 1]
+    assert [body.joint.parent for body in described.parts if body.joint] == [0, 1]
+    assert described.ref.id == "cabinet-1"
+    assert described.ref.category == "StorageFurniture"
+
+
+def test_zero_pose_is_the_zero_pose_of_the_urdf(folder: Path) -> None:
+    described = read_object(folder)
+    world_from_body_link = translation(0, 0, 1)
+    world_from_body_link[:3, :3] = urdf_rotation(np.pi / 2, 0, -np.pi / 2)
+    poses = described.body_poses(np.zeros(2))
+    expected_door = world_from_body_link @ translation(0.5, 0.25, 0)
+    assert np.allclose(poses[1], expected_door)
+    assert np.allclose(poses[2], expected_door @ translation(0, 0, 0.5) @ translation(0, 1, 0))
+    # The handle's own origin is baked into the door's frame.
+    assert np.allclose(described.bodies[1].visuals[1].vertices.mean(axis=0), [0, 0, 0.5])
+
+
+def test_a_joint_moves_its_part_and_what_hangs_on_it_alone(folder: Path) -> None:
+    described = read_object(folder)
+    closed = described.body_poses(np.zeros(2))
+    opened, turned = described.body_poses(np.array([0.7, 0.0])), described.body_poses(np.array([0.0, 0.7]))
+    assert np.array_equal(opened[0], closed[0])
+    assert not np.allclose(opened[1], closed[1])
+    assert not np.allclose(opened[2], closed[2])
+    assert np.array_equal(turned[:2], closed[:2])
+    # What lies on the axis stays where it is.
+    assert np.allclose(opened[1][:3, 3], closed[1][:3, 3])
+
+
+def test_free_joints_are_cut_to_pi_and_axes_are_unit(folder: Path) -> None:
+    limits = read_object(folder).limits()
+    assert np.allclose(limits, [[0, 1.5], [-np.pi, np.pi]])
+    edit(folder, 'lower="0" upper="1.5"', 'lower="-inf" upper="inf"')
+    described = read_object(folder)
+    assert np.allclose(described.limits()[0], [-np.pi, np.pi])
+    assert all(np.isclose(np.linalg.norm(body.joint.axis), 1) for body in described.parts if body.joint)
+
+
+def test_a_body_without_collision_meshes_collides_as_it_looks(folder: Path) -> None:
+    described = read_object(folder)
+    assert described.bodies[2].collisions == described.bodies[2].visuals
+    assert np.allclose(np.abs(described.bodies[0].collisions[0].vertices - [0, 0, 1]), 1)
+
+
+def test_the_hash_changes_if_and_only_if_the_content_does(folder: Path) -> None:
+    first = read_object(folder).ref.content_hash
+    (folder / "unused.txt").write_text("anything")
+    (folder / "textured_objs/unused.obj").write_text("anything")
+    edit(folder, "}", ', "user_id": "someone"}', "meta.json")
+    assert read_object(folder).ref.content_hash == first
+    seen = {first}
+    for name, old, new in (
+        ("textured_objs/cube.obj", "v 0 0 0", "v 0 0 0.001"),
+        ("mobility.urdf", 'upper="1.5"', 'upper="1.6"'),
+        ("semantics.txt", "knob", "dial"),
+        ("meta.json", "StorageFurniture", "Safe"),
+    ):
+        edit(folder, old, new, name)
+        seen.add(read_object(folder).ref.content_hash)
+    assert len(seen) == 5
+
+
+def _truncate(folder: Path) -> None:
+    path = folder / "textured_objs/cube.obj"
+    path.write_bytes(path.read_bytes()[: -len("2//1 6//1 8//1 4//1\n") + 3])
+
+
+def _deep_json(folder: Path) -> None:
+    (folder / "meta.json").write_text("[" * 200_000)
+
+
+def _many_links(folder: Path) -> None:
+    edit(folder, "</robot>", "".join(f'<link name="l{i}"/>' for i in range(urdf.MAX_LINKS)) + "</robot>")
+
+
+def _many_shapes(folder: Path) -> None:
+    shape = '<visual><geometry><box size="1 1 1"/></geometry></visual>'
+    edit(folder, '<link name="lock">', '<link name="lock">' + shape * urdf.MAX_SHAPES)
+
+
+def _many_copies(folder: Path) -> None:
+    # One large mesh that a small URDF shows again and again.
+    rows = "".join(f"v {i} 0 0\n" for i in range(20_000))
+    (folder / "textured_objs/cube.obj").write_text(rows + "f 1 2 3\n")
+    shapes = "".join(
+        f'<visual><origin xyz="{i} 0 0"/><geometry><mesh filename="textured_objs/cube.obj"/></geometry></visual>'
+        for i in range(300)
+    )
+    edit(folder, '<link name="lock">', '<link name="lock">' + shapes)
+
+
+def _escape_by_link(folder: Path) -> None:
+    (folder.parent / "secret.obj").write_text(CUBE_OBJ)
+    (folder / "textured_objs/cube.obj").unlink()
+    (folder / "textured_objs/cube.obj").symlink_to(folder.parent / "secret.obj")
+
+
+def _pipe(folder: Path) -> None:
+    (folder / "mobility.urdf").unlink()
+    os.mkfifo(folder / "mobility.urdf")
+
+
+def _replaced(old: str, new: str, name: str = "mobility.urdf") -> Callable[[Path], None]:
+    return lambda folder: edit(folder, old, new, name)
+
+
+def _written(name: str, data: bytes) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        (folder / name).write_bytes(data)
+
+    return write
+
+
+def _removed(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
+
+
+BOMB = (
+    b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">'
+    + b"".join(b'<!ENTITY b%d "%s">' % (i, (b"&b%d;" % (i - 1) if i else b"&a;") * 10) for i in range(9))
+    + b"]><robot name='&b8;'/>"
+)
+CUBE = "textured_objs/cube.obj"
+HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
+    "no URDF": (_removed("mobility.urdf"), "is missing"),
+    "no meta": (_removed("meta.json"), "is missing"),
+    "missing mesh": (_removed(CUBE), "1 of 1 mesh files are missing, such as textured_objs/cube.obj"),
+    "truncated OBJ": (_truncate, "truncated"),
+    "empty OBJ": (_written(CUBE, b""), "no faces"),
+    "OBJ cut before its faces": (_written(CUBE, b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"), "no faces"),
+    "OBJ half a vertex": (_written(CUBE, b"v 0 0 0\nv 1 0\nf 1 1 1\n"), "vertex 2 has 2 numbers"),
+    "OBJ half a face": (_written(CUBE, b"v 0 0 0\nv 1 0 0\nf 1 2\n"), "2 corners"),
+    "OBJ half a corner": (_written(CUBE, b"v 0 0 0\nf 1/1 1/1 1/"), "incomplete"),
+    "OBJ index out of range": (_written(CUBE, b"v 0 0 0\nf 1 1 2\n"), "among the 1"),
+    "OBJ index zero": (_written(CUBE, b"v 0 0 0\nf 0 1 1\n"), "among the 1"),
+    "OBJ negative index too low": (_written(CUBE, b"v 0 0 0\nf -1 -1 -2\n"), "among the 1"),
+    "OBJ giant index": (_written(CUBE, b"v 0 0 0\nf 1 1 99999999999999999999999\n"), "not a vertex number"),
+    "OBJ not a number": (_written(CUBE, b"v 0 0 zero\nf 1 1 1\n"), "not a number"),
+    "OBJ NaN": (_written(CUBE, b"v 0 0 nan\nf 1 1 1\n"), "not finite"),
+    "OBJ infinite": (_written(CUBE, b"v 0 0 -inf\nf 1 1 1\n"), "not finite"),
+    "OBJ binary": (_written(CUBE, bytes(range(256))), "not a Wavefront OBJ statement"),
+    "OBJ unknown statement": (_written(CUBE, b"v 0 0 0\nf 1 1 1\ncall other.obj\n"), "not a Wavefront OBJ statement"),
+    "malformed XML": (_replaced("</robot>", "</robo"), "malformed XML"),
+    "XML in an unknown encoding": (_written("mobility.urdf", b'<?xml version="1.0" encoding="nil"?><a/>'), "malformed"),
+    "not XML": (_written("mobility.urdf", b"\0\1\2"), "malformed XML"),
+    "not a robot": (_written("mobility.urdf", b"<html/>"), "instead of <robot>"),
+    "no links": (_written("mobility.urdf", b"<robot/>"), "no links"),
+    "entity expansion": (_written("mobility.urdf", BOMB), "document types and entities are refused"),
+    "external entity": (
+        _written("mobility.urdf", b'<!DOCTYPE x SYSTEM "file:///etc/passwd"><robot/>'),
+        "document types and entities are refused",
+    ),
+    "deep XML": (_written("mobility.urdf", b"<a>" * 300_000), "malformed XML"),
+    "large URDF": (_written("mobility.urdf", b" " * (urdf.MAX_URDF_BYTES + 1)), "at most"),
+    "pipe": (_pipe, "not a regular file"),
+    "path escape": (_replaced('"textured_objs/cube.obj"/>', '"../secret.obj"/>'), "not a plain path"),
+    "absolute path": (_replaced('"textured_objs/cube.obj"/>', '"/etc/secret.obj"/>'), "not a plain path"),
+    "escape by a link": (_escape_by_link, "leads out"),
+    "not an OBJ": (_replaced('"textured_objs/cube.obj"/>', '"cube.stl"/>'), "must name an .obj file"),
+    "cycle": (_replaced('<parent link="base"/>', '<parent link="lock"/>'), "cycle"),
+    "cycle of everything": (
+        _replaced("</robot>", '<joint name="j" type="fixed"><parent link="lock"/><child link="base"/></joint></robot>'),
+        "no root link",
+    ),
+    "several roots": (_replaced("</robot>", '<link name="other"/></robot>'), "2 root links"),
+    "two joints move a link": (
+        _replaced("</robot>", '<joint name="j" type="fixed"><parent link="base"/><child link="lock"/></joint></robot>'),
+        "two joints move the link 'lock'",
+    ),
+    "links of one name": (_replaced('<link name="lock">', '<link name="door">'), "two links are called 'door'"),
+    "unknown link": (_replaced('<child link="lock"/>', '<child link="key"/>'), "which is not there"),
+    "NaN limit": (_replaced('upper="1.5"', 'upper="nan"'), "limits must be numbers"),
+    "giant limit": (_replaced('upper="1.5"', 'upper="1e300"'), "limits must be numbers"),
+    "limit that is no number": (_replaced('upper="1.5"', 'upper="far"'), "not a number"),
+    "no limit": (_replaced('<limit lower="0" upper="1.5"/>', ""), "needs a <limit>"),
+    "limits reversed": (_replaced('lower="0" upper="1.5"', 'lower="1" upper="0"'), "above the upper limit"),
+    "limits beyond pi": (_replaced('lower="0" upper="1.5"', 'lower="4" upper="inf"'), "leave nothing"),
+    "zero axis": (_replaced('xyz="0 0.1 0"', 'xyz="0 0 0"'), "the axis is zero"),
+    "NaN axis": (_replaced('xyz="0 0.1 0"', 'xyz="0 nan 0"'), "finite numbers"),
+    "infinite origin": (_replaced('xyz="0.5 0.25 0"', 'xyz="0.5 inf 0"'), "finite numbers"),
+    "short axis": (_replaced('xyz="0 0.1 0"', 'xyz="0 1"'), "needs 3"),
+    "negative box": (_replaced('size="2 2 2"', 'size="2 2 -2"'), "positive size"),
+    "floating joint": (_replaced('type="continuous"', 'type="floating"'), "allowed: fixed, revolute"),
+    "no movable joint": (
+        lambda folder: (edit(folder, 'type="revolute"', 'type="fixed"'), edit(folder, '"continuous"', '"fixed"'))[0],
+        "has no movable part",
+    ),
+    "movable parts without meshes": (
+        _written(
+            "mobility.urdf",
+            b'<robot><link name="a"/><link name="b"/><joint name="j" type="continuous">'
+            b'<parent link="a"/><child link="b"/></joint></robot>',
+        ),
+        "has no movable part",
+    ),
+    "many links": (_many_links, "at most 500"),
+    "many shapes": (_many_shapes, "more than 5000 shapes"),
+    "many copies of a large mesh": (_many_copies, "vertices in all"),
+    "deep JSON": (_deep_json, "malformed JSON"),
+    "malformed JSON": (_written("meta.json", b"{"), "malformed JSON"),
+    "JSON with a giant number": (_written("meta.json", b"9" * 10_000), "malformed JSON"),
+    "JSON that is no object": (_written("meta.json", b"[]"), "needs a 'model_cat'"),
+    "no category": (_written("meta.json", b'{"model_cat": 3}'), "needs a 'model_cat'"),
+    "semantics of two words": (_written("semantics.txt", b"link_0 hinge\n"), "line 1"),
+    "binary semantics": (_written("semantics.txt", b"\xff\xfe"), "not UTF-8"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_cannot_be_used_is_refused_with_one_line(folder: Path, name: str) -> None:
+    spoil, expected = HOSTILE[name]
+    read_object(folder)
+    spoil(folder)
+    begun = time.perf_counter()
+    with pytest.raises(ObjectError) as refusal:
+        read_object(folder)
+    message = str(refusal.value)
+    assert expected in message
+    assert "\n" not in message
+    assert len(message) < 500
+    assert time.perf_counter() - begun < 5
+
+
+def test_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ObjectError, match="no such folder"):
+        read_object(tmp_path / "nothing")
+
+
+def test_an_id_that_cannot_be_stored_is_refused(folder: Path) -> None:
+    with pytest.raises(ObjectError, match="the folder's name is the object's id"):
+        read_object(folder.rename(folder.parent / "no good"))
+
+
+def test_a_file_that_is_linked_within_the_folder_is_read(folder: Path) -> None:
+    (folder / "link.obj").symlink_to("textured_objs/cube.obj")
+    assert ObjectFiles(folder).read("link.obj", 10_000) == CUBE_OBJ.encode()
+
+
+def test_obj_forms_of_indices_agree() -> None:
+    vertices = "v 0 0 0\nv 1 0 0 1.0\nv 1 1 0 0.5 0.5 0.5\nv 0 1 0\n"
+    plain = meshes.parse_obj((vertices + "f 1 2 3 4\n").encode(), "plain")
+    assert plain.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    for face in ("f 1/1 2/1 3/1 4/1", "f 1//1 2//1 3//1 4//1", "f 1/1/1 2/1/1 3/1/1 4/1/1", "f -4 -3 -2 -1"):
+        again = meshes.parse_obj((vertices + face).encode(), face)
+        assert np.array_equal(again.faces, plain.faces)
+        assert np.array_equal(again.vertices, plain.vertices)
+
+
+def test_negative_obj_indices_count_from_their_own_line() -> None:
+    mesh = meshes.parse_obj(b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 1\r\n\tf -4 -3 -1\r\n", "groups")
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 3]]
+
+
+@given(corners=st.lists(st.integers(3, 9), min_size=1, max_size=8))
+@settings(max_examples=30)
+def test_fans_cover_polygons_of_any_size(corners: list[int]) -> None:
+    vertices = "".join(f"v {i} {i * i} 0\n" for i in range(max(corners)))
+    faces = "".join("f " + " ".join(str(i + 1) for i in range(n)) + "\n" for n in corners)
+    mesh = meshes.parse_obj((vertices + faces).encode(), "fans")
+    expected = [[0, i + 1, i + 2] for n in corners for i in range(n - 2)]
+    assert mesh.faces.tolist() == expected
+
+
+@given(data=st.binary(max_size=200))
+@settings(max_examples=100)
+def test_no_bytes_make_the_parsers_fail_otherwise(data: bytes) -> None:
+    for parse in (meshes.parse_obj, urdf.parse_urdf):
+        with pytest.raises(ObjectError):
+            parse(data, "noise")
+
+
+@pytest.mark.parametrize("mesh", [meshes.box(np.ones(3)), meshes.frustum(0.5, 0.3, 1.0), meshes.sphere(0.5)])
+def test_primitive_shapes_are_closed_and_face_outward(mesh: meshes.Mesh) -> None:
+    assert signed_volume(mesh) > 0.2
+    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).tolist()
+    assert sorted(map(tuple, edges)) == sorted((b, a) for a, b in edges)
+
+
+def test_a_mirroring_scale_keeps_normals_outward() -> None:
+    mirrored = meshes.placed(meshes.box(np.ones(3)), np.eye(4), np.array([-1.0, 2.0, 1.0]))
+    assert np.isclose(signed_volume(mirrored), 2.0)
+
+
+def signed_volume(mesh: meshes.Mesh) -> float:
+    corners = mesh.vertices[mesh.faces]
+    return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
+
+
+def translation(x: float, y: float, z: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def urdf_rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Written apart from the reader: three rotations about fixed axes."""
+
+    def about(axis: int, angle: float) -> np.ndarray:
+        turn, (i, j) = np.eye(3), [(1, 2), (2, 0), (0, 1)][axis]
+        turn[i, i] = turn[j, j] = np.cos(angle)
+        turn[j, i], turn[i, j] = np.sin(angle), -np.sin(angle)
+        return turn
+
+    return about(2, yaw) @ about(1, pitch) @ about(0, roll)
