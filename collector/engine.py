@@ -74,6 +74,7 @@ class Assembly:
         parent_from_joint: Float | None = None,
         child_from_joint: Float | None = None,
         limits: tuple[float, float] = (0.0, 0.0),
+        touches_own_kind: bool = True,
     ) -> Link:
         """Add one link.
 
@@ -86,12 +87,15 @@ class Assembly:
             parent_from_joint: [4, 4], of the joint's frame in the parent; identity where None.
             child_from_joint: [4, 4], of the joint's frame in the link; identity where None.
             limits: of the joint position.
+            touches_own_kind: whether it collides with other links for which this is false.
         """
         link = Link(parent)
         link.name = name
         for mesh in meshes:
             shape = _convex_shape(mesh, self._material)
             if shape is not None:
+                # Shapes that share a bit of the third group and the number in the fourth ignore each other.
+                shape.set_collision_groups([1, 1, 0, 0] if touches_own_kind else [1, 1, 1, 1])
                 link.attach(shape)
         entity = sapien.Entity()
         entity.name = name
@@ -124,7 +128,6 @@ def _convex_shape(mesh: Mesh, material: physx.PhysxMaterial) -> physx.PhysxColli
         )
     except RuntimeError:
         return None
-    shape.set_collision_groups([1, 1, 0, 0])
     shape.set_density(DENSITY)
     return shape
 

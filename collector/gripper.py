@@ -98,6 +98,14 @@ class Gripper:
             joint.set_drive_target(float(target))
             joint.set_drive_velocity_target(0.0)
 
+    def shift(self, displacement: Float, velocity: Float) -> None:
+        """Put the hand at `displacement`, [3], from where it was placed, hand frame, moving at `velocity`, [3]."""
+        positions, velocities = self.articulation.get_qpos(), np.zeros(8, dtype=np.float32)
+        positions[:6] = np.append(displacement, np.zeros(3))
+        velocities[:3] = velocity
+        self.articulation.set_qpos(positions)
+        self.articulation.set_qvel(velocities)
+
     def drive_fingers(self, opening: float) -> None:
         """Drive each finger to `opening`."""
         for joint in self.joints[6:]:
@@ -124,6 +132,7 @@ def add_gripper(scene: sapien.Scene, material: physx.PhysxMaterial) -> Gripper:
                 parent_from_joint=_frame(along),
                 child_from_joint=_frame(along),
                 limits=(-10.0, 10.0),
+                touches_own_kind=False,
             )
     hand = link
     for name, side in (("left", 1.0), ("right", -1.0)):
@@ -136,6 +145,7 @@ def add_gripper(scene: sapien.Scene, material: physx.PhysxMaterial) -> Gripper:
             parent_from_joint=_frame(np.diag([side, side, 1.0]), (0.0, 0.0, FINGER_OFFSET)) @ _frame(_ALONG["y"]),
             child_from_joint=_frame(_ALONG["y"]),
             limits=(0.0, FINGER_OPEN),
+            touches_own_kind=False,
         )
     left, right = assembly.links[-2:]
     for link in assembly.links:

@@ -26,6 +26,11 @@ MOTION_SHARE = 0.5
 """Or this share of the joint's range, for joints whose range is small."""
 DIRECTION_COSINE = 0.5
 """The touched point must move within 60 deg of where the primitive means to take it."""
+CLEARANCE = 1e-3
+"""Free flight ends this far before the object."""
+REST_STEPS, REST_MOTION = 8, 3e-6
+"""A hold may end when hand and object moved by less than the second a step over the first; at the time constant of the
+hand's drives (0.4 s) less than 0.3 mm is then left to come."""
 SANE_POSITION = 1e3
 """A joint position beyond this means that the simulation diverged."""
 
@@ -123,7 +128,7 @@ class Trial:
 
     def _execute(self) -> None:
         path, gripper, fidelity = trajectory(self.primitive), self.scene.gripper, self.fidelity
-        self._leg(path.approach)
+        self._leg(path.approach, self._free_flight(path.approach) if fidelity.skip_free_flight else 0)
         self._hold()
         if self.primitive.pulls:
             gripper.drive_fingers(0.0)
@@ -134,17 +139,18 @@ class Trial:
         if path.then is not None:
             self._leg(path.then)
             self._hold()
-        assert self.steps <= 2 * fidelity.leg_steps + 3 * fidelity.hold_steps
 
-    def _leg(self, end: Float) -> None:
-        """Drive the hand along a straight line to `end`, [3], hand frame, at constant speed."""
+    def _leg(self, end: Float, first: int = 0) -> None:
+        """Drive the hand along a straight line to `end`, [3], hand frame, at constant speed, from step `first` on."""
         start, steps = self._hand_at, self.fidelity.leg_steps
         velocity = (end - start) * (self.fidelity.steps_per_second / steps)
         moving = [k for k in range(3) if velocity[k] != 0.0]
         joints = self.scene.gripper.joints
+        if first:
+            self.scene.gripper.shift(start + (end - start) * (first / steps), velocity)
         for k in moving:
             joints[k].set_drive_velocity_target(velocity[k])
-        for step in range(1, steps + 1):
+        for step in range(first + 1, steps + 1):
             for k in moving:
                 joints[k].set_drive_target(start[k] + (end[k] - start[k]) * (step / steps))
             self._step()
@@ -152,10 +158,33 @@ class Trial:
             joints[k].set_drive_velocity_target(0.0)
         self._hand_at = end
 
+    def _free_flight(self, end: Float) -> int:
+        """How many steps of the leg to `end`, [3], pass before the hand comes near the object.
+
+        Nothing happens in these, so they need not be simulated. The hand is put ever further along its way, each time
+        by no more than its clearance, so that it cannot pass through anything.
+        """
+        steps, length = self.fidelity.leg_steps, float(np.linalg.norm(end))
+        done = 0
+        while done < steps:
+            self.scene.gripper.shift(end * (done / steps), np.zeros(3))
+            self._step()
+            ahead = (self.scene.contact().clearance - CLEARANCE) / length * steps
+            if ahead < 1:
+                break
+            done = min(done + int(ahead), steps)
+        return done
+
     def _hold(self) -> None:
         """Keep all drive targets for a while."""
-        for _ in range(self.fidelity.hold_steps):
+        before = np.zeros(0)
+        for step in range(self.fidelity.hold_steps):
             self._step()
+            if self.fidelity.end_holds_at_rest and step % REST_STEPS == 0:
+                now = self.scene.all_joint_positions()
+                if step and np.abs(now - before).max() < REST_STEPS * REST_MOTION:
+                    return
+                before = now
 
     def _step(self) -> None:
         self.scene.system.step()

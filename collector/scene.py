@@ -20,7 +20,10 @@ FRICTION_DAMPING = 1e5
 limit / damping a second."""
 CONTACT_FORCE = 5.0
 """N. The published rule counts contact points with a squared impulse above 1e-4; at its 1/500 s that is this force."""
+CONTACT_RANGE = 0.02
+"""The engine lists pairs that are closer than this: the sum of two shapes' contact offsets."""
 FORGETTING_STEPS = 1
+"""Steps with the hand out of reach, after which the engine holds no contact of the trial before."""
 PARKED = np.array([0.0, 0.0, 50.0])
 """Where the hand waits while the object settles, out of reach of everything."""
 
@@ -33,11 +36,13 @@ class Contact:
         finger_on: bodies (0 the root, k the k-th part) that a finger presses on.
         palm: whether the palm presses on anything.
         brushes: whether the hand touches anything at all, however lightly.
+        clearance: how far the hand is from the object at least, as far as the engine looks.
     """
 
     finger_on: frozenset[int]
     palm: bool
     brushes: bool
+    clearance: float
 
     @property
     def any(self) -> bool:
@@ -85,6 +90,10 @@ class Scene:
     def joint_positions(self) -> Float:
         """[parts], in part order."""
         return np.asarray(self._articulation.get_qpos(), dtype=np.float64)[self._order]
+
+    def all_joint_positions(self) -> Float:
+        """Of the object, then of the hand."""
+        return np.concatenate([self._articulation.get_qpos(), self.gripper.articulation.get_qpos()])
 
     def put(self, positions: Float) -> None:
         """Put the object at rest with its joints at `positions`, [parts], and the hand out of reach.
@@ -139,13 +148,14 @@ class Scene:
 
     def contact(self) -> Contact:
         """What the hand touches after the last step."""
-        finger_on, palm, brushes = set(), False, False
+        finger_on, palm, brushes, clearance = set(), False, False, CONTACT_RANGE
         for contact in self.system.get_contacts():
             first, second = contact.bodies
             if (first in self._hand) == (second in self._hand):
                 continue
             strongest = max((float(p.impulse @ p.impulse) for p in contact.points), default=0.0)
             brushes = brushes or strongest > 0.0
+            clearance = min(clearance, *(p.separation for p in contact.points))
             if strongest <= self._impulse_squared:
                 continue
             hand, other = (first, second) if first in self._hand else (second, first)
@@ -153,7 +163,7 @@ class Scene:
                 palm = True
             else:
                 finger_on.add(self._bodies[other])
-        return Contact(frozenset(finger_on), palm, brushes)
+        return Contact(frozenset(finger_on), palm, brushes, clearance)
 
     def _presses(self) -> bool:
         """Whether anything presses on anything."""

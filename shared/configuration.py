@@ -68,11 +68,22 @@ class Fidelity(StrictModel):
     hold_steps: int = Field(240, ge=0)
     """Steps of hold after a leg."""
     solver_iterations: int = Field(20, ge=1, le=255)
+    skip_free_flight: bool = True
+    """Begin an approach where the hand comes within a millimetre of the object, instead of where it starts."""
+    end_holds_at_rest: bool = True
+    """End a hold once neither hand nor object moves."""
 
 
 FIDELITIES = {
     "fast": Fidelity(),
-    "reference": Fidelity(name="reference", steps_per_second=500, leg_steps=2000, hold_steps=2000),
+    "reference": Fidelity(
+        name="reference",
+        steps_per_second=500,
+        leg_steps=2000,
+        hold_steps=2000,
+        skip_free_flight=False,
+        end_holds_at_rest=False,
+    ),
 }
 
 
