@@ -85,7 +85,7 @@ def test_head_is_one_layer_on_the_concatenation() -> None:
 
 
 @given(st.integers(0, 2**31 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_any_six_numbers_give_a_rotation(seed: int) -> None:
     raw = torch.randn(4, 6, generator=torch.Generator().manual_seed(seed))
     raw[1] = 0.0

@@ -12,7 +12,8 @@ from shared.networks.configuration import NetworkConfig
 FRAME_WIDTH = 6
 MOTION_SCALE = 0.01
 """The motion that counts as a success, tau of the paper; log(1 + m / tau) spreads small motions out."""
-_DEGENERATE = 1e-6
+_DEGENERATE = 1e-4
+"""Length below which a direction is mostly rounding."""
 
 
 def action_width(config: NetworkConfig) -> int:
@@ -62,11 +63,11 @@ def orthonormal_frames(raw: Tensor) -> Tensor:
     action that is not a rotation.
     """
     approach = _unit(raw[..., :3], raw.new_tensor([1.0, 0.0, 0.0]))
-    forward = raw[..., 3:] - (raw[..., 3:] * approach).sum(dim=-1, keepdim=True) * approach
     # The axis that the approach has least of is never parallel to it.
     spare = functional.one_hot(approach.detach().abs().argmin(dim=-1), 3).to(raw.dtype)
-    spare = spare - (spare * approach).sum(dim=-1, keepdim=True) * approach
-    return torch.cat([approach, _unit(forward, functional.normalize(spare, dim=-1))], dim=-1)
+    forward = _unit(_across(_unit(raw[..., 3:], spare), approach), _across(spare, approach))
+    # Of a nearly parallel pair the first pass leaves mostly rounding; the second takes that out.
+    return torch.cat([approach, functional.normalize(_across(forward, approach), dim=-1)], dim=-1)
 
 
 def geodesic_distance(frames: Tensor, others: Tensor) -> Tensor:
@@ -80,6 +81,11 @@ def geodesic_distance(frames: Tensor, others: Tensor) -> Tensor:
 def _columns(frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     approach, forward = frames[..., :3], frames[..., 3:]
     return approach, forward, torch.linalg.cross(approach, forward)
+
+
+def _across(x: Tensor, unit: Tensor) -> Tensor:
+    """The part of `x` at right angles to a unit vector."""
+    return x - (x * unit).sum(dim=-1, keepdim=True) * unit
 
 
 def _unit(x: Tensor, fallback: Tensor) -> Tensor:
