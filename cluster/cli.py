@@ -3,6 +3,7 @@
 Heavy packages are imported by the subcommands that need them, so that help is instant.
 """
 
+import logging
 import os
 import signal
 import sys
@@ -32,6 +33,9 @@ USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells 
 
 def main() -> NoReturn:
     """Run the command line of this process and exit."""
+    logging.basicConfig(format="adaafford: %(message)s", level=logging.WARNING)
+    # As Ctrl-C does, so that workers and learners are ended in an orderly way.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     sys.exit(run(sys.argv[1:]))
 
 

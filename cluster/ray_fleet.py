@@ -135,10 +135,10 @@ class RayFleet:
 
     def _count(self, job: Job, attempts: Counter[Job], reason: str) -> None:
         """Count a failure of `job` and give up after `MAX_ATTEMPTS`."""
-        logger.warning("job %s failed: %s", job.shard_id, reason)
         attempts[job] += 1
         if attempts[job] >= MAX_ATTEMPTS:
             raise JobError(job, reason)
+        logger.warning("job %s failed (%s); trying again", job.shard_id, reason)
 
     def _start(self) -> Any:
         """A new actor. No restarts by Ray: those would run only `__init__` again, and lose what was in flight."""

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -66,6 +67,7 @@ def ray_session(workers: int, address: str | None = None) -> Iterator[None]:
         UsageError: there is no cluster at `address`.
     """
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    on_terminate = signal.getsignal(signal.SIGTERM)
     os.environ.update(_ENVIRONMENT)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ray's own deprecations; a user can do nothing about them.
@@ -83,6 +85,8 @@ def ray_session(workers: int, address: str | None = None) -> Iterator[None]:
             for name, value in before.items():
                 os.environ.pop(name, None) if value is None else os.environ.update({name: value})
     try:
+        # Ray has put a handler of its own in place of ours.
+        signal.signal(signal.SIGTERM, on_terminate)
         yield
     finally:
         ray.shutdown()
