@@ -14,7 +14,7 @@ from learner.data import Dataset, Split
 from learner.losses import action_scoring_loss, actionability_loss, distillation_loss, top_score
 from learner.metrics import discrimination
 from learner.oracle import OracleCritic
-from learner.sampling import OrderedRows, ProposalPool, draw_numbers, order_rows
+from learner.sampling import OrderedRows, ProposalPool, draw_numbers, order_rows, spread
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aap import Aap
 from shared.networks.pointnet2 import EncodedClouds
@@ -102,7 +102,7 @@ class AapStage:
     def validate(self) -> dict[str, float]:
         """Figures on objects not trained on, before and after the longest context; "score" sums both losses."""
         rng = np.random.default_rng(_VALIDATION_SEED)
-        rollouts = self.parts.validation[:VALIDATION_ROLLOUTS]
+        rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
         scores: tuple[list[Tensor], list[Tensor]] = ([], [])
         labels, losses, affordance = [], [], []
         for start in range(0, len(rollouts), _CHUNK):
@@ -188,7 +188,7 @@ class OracleStage:
     def validate(self) -> dict[str, float]:
         """The oracle critic's figures on objects not trained on: a bound for what adaptation can reach."""
         rng = np.random.default_rng(_VALIDATION_SEED)
-        rollouts = self.parts.validation[:VALIDATION_ROLLOUTS]
+        rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
         scores, labels = [], []
         for start in range(0, len(rollouts), _CHUNK):
             ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)

@@ -16,10 +16,9 @@ from learner.losses import (
     actionability_loss,
     information_gains,
     information_loss,
-    masked_mean,
     top_score,
 )
-from learner.sampling import OrderedRows, ProposalPool, draw_numbers, frozen_features, order_rows
+from learner.sampling import OrderedRows, ProposalPool, draw_numbers, frozen_features, order_rows, spread
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aap import Aap
 from shared.networks.aip import Aip
@@ -27,6 +26,8 @@ from shared.networks.pointnet2 import EncodedClouds
 
 VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 21
+_CHUNK = 4
+"""Rollouts validated at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,20 +123,26 @@ class AipStage:
         "critic" is to be compared with "critic_of_median", the loss of a constant.
         """
         rng = np.random.default_rng(_VALIDATION_SEED)
-        ordered = self._order(list(self.parts.validation[:VALIDATION_ROLLOUTS]), rng)
-        found = self.gains(ordered)
-        encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
-        predicted = self._predict(ordered, found, encoded)
-        critic = float(information_loss(predicted, found.gains, found.mask))
-        affordance = float(self._actionability_loss(ordered, found, encoded, rng))
-        gains, guesses = found.gains[found.mask], predicted[found.mask]
+        rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
+        affordance, kept_gains, kept_guesses = [], [], []
+        for start in range(0, len(rollouts), _CHUNK):
+            ordered = self._order(rollouts[start : start + _CHUNK], rng)
+            found = self.gains(ordered)
+            encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
+            kept_guesses.append(self._predict(ordered, found, encoded)[found.mask])
+            kept_gains.append(found.gains[found.mask])
+            affordance.append(self._actionability_loss(ordered, found, encoded, rng))
+        gains, guesses = torch.cat(kept_gains), torch.cat(kept_guesses)
+        everything = torch.ones_like(gains, dtype=torch.bool)
+        critic = float(information_loss(guesses, gains, everything))
+        mean_affordance = float(torch.stack(affordance).mean())
         together = torch.stack([gains, guesses])
         varied = len(gains) > 1 and bool((together.std(dim=1) > 0).all())
         return {
-            "score": critic + affordance,
+            "score": critic + mean_affordance,
             "critic": critic,
-            "affordance": affordance,
-            "critic_of_median": float(masked_mean((found.gains - gains.median()).abs(), found.mask)),
+            "affordance": mean_affordance,
+            "critic_of_median": float((gains - gains.median()).abs().mean()),
             "mean_gain": float(gains.mean()),
             "correlation": float(torch.corrcoef(together)[0, 1]) if varied else float("nan"),
         }

@@ -11,7 +11,7 @@ from learner.configuration import PriorConfig
 from learner.data import Dataset, Split
 from learner.losses import action_scoring_loss, actionability_loss, mean_score, proposal_loss
 from learner.metrics import discrimination
-from learner.sampling import draw_numbers, frozen_features
+from learner.sampling import draw_numbers, frozen_features, spread
 from learner.training import ParameterGroup, StepResult
 from shared.networks.prior import Prior
 
@@ -49,7 +49,9 @@ class PriorStage:
     def validate(self) -> dict[str, float]:
         """Figures on objects not trained on; "score" is the sum of the three losses on some of their rows."""
         scores, success = self.scores(self._validation), self.dataset.rows.success[self._validation]
-        losses = self._losses(self._validation[:VALIDATION_ROWS], np.random.default_rng(_VALIDATION_SEED))
+        losses = self._losses(
+            torch.tensor(spread(self._validation.tolist(), VALIDATION_ROWS)), np.random.default_rng(_VALIDATION_SEED)
+        )
         found = discrimination(scores.numpy(), success.numpy())
         return {
             "score": float(torch.stack(list(losses.values())).sum()),

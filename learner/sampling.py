@@ -141,6 +141,11 @@ def frozen_features(encoder: PointNet2, clouds: CloudBatch, cloud: Tensor, point
     return features
 
 
+def spread(numbers: Sequence[int], most: int) -> list[int]:
+    """At most `most` of the numbers, evenly over all of them, so that no plan or object is left out."""
+    return [numbers[place] for place in np.linspace(0, len(numbers) - 1, min(most, len(numbers))).astype(int)]
+
+
 def draw_numbers(count: int, size: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """`size` numbers below `count`, each once where there are enough."""
     return rng.choice(count, size, replace=size > count)
