@@ -1,1 +1,47 @@
-"""Affordance that adapts to one articulated object after a few tries: the public face."""
+"""Affordance that adapts to one articulated object after a few tries: the public face.
+
+A robot's author implements `Environment` over a camera and an arm, and lets the policy choose:
+
+>>> adapter = Adapter(Policy.from_files(open_store(path).read_policy(2)))
+>>> proposer, history = AipProposer(adapter, numpy.random.default_rng(1), budget=4), []
+>>> while (action := proposer.propose(observation := robot.observe(), history)) is not None:
+...     history.append(Interaction(observation, action, robot.execute(action)))
+>>> heat = adapter.affordance(robot.observe(), history)      # [N], where the part can be moved
+"""
+
+from importlib.metadata import version
+
+from shared.adaptation import Adapter, AipProposer, ExploitProposer
+from shared.errors import AdaAffordError
+from shared.policy import Policy
+from shared.store import Store
+from shared.vocabulary import (
+    Action,
+    Environment,
+    Interaction,
+    Observation,
+    Outcome,
+    OutcomeKind,
+    Proposer,
+)
+
+__version__ = version("adaafford")
+open_store = Store.open
+
+__all__ = [
+    "Action",
+    "AdaAffordError",
+    "Adapter",
+    "AipProposer",
+    "Environment",
+    "ExploitProposer",
+    "Interaction",
+    "Observation",
+    "Outcome",
+    "OutcomeKind",
+    "Policy",
+    "Proposer",
+    "Store",
+    "__version__",
+    "open_store",
+]

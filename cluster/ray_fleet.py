@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 IN_FLIGHT = 2
 """Jobs an actor holds: one under way, one that waits so that the actor never idles for the driver's sake."""
+START_LIMIT_S = 120.0
+"""An actor's process imports an engine and PyTorch, which a busy machine or a cold disk may slow; no job's fault."""
 POLL_S = 1.0
 """How often the driver looks for hung actors when no receipt comes."""
 
@@ -31,9 +33,11 @@ class _Seat:
     """A place for one actor, and what it was given to do, oldest first."""
 
     actor: Any = None
+    arrival: Any = None
+    """What becomes ready when the actor's process is up; None from then on."""
     pending: deque[tuple[Any, Job]] = field(default_factory=deque)
     busy_since: float = 0.0
-    """When the oldest pending job came to the head, `time.monotonic`."""
+    """When the actor was started, or the oldest pending job came to the head; `time.monotonic`."""
 
 
 class RayFleet:
@@ -66,7 +70,8 @@ class RayFleet:
         try:
             while waiting or any(seat.pending for seat in self._seats):
                 self._hand_out(plan, waiting)
-                refs = [ref for seat in self._seats for ref, _ in seat.pending]
+                # A seat whose actor is still on its way has nothing else that could be ready.
+                refs = [seat.arrival or seat.pending[0][0] for seat in self._seats if seat.pending]
                 ready, _ = ray.wait(refs, num_returns=1, timeout=min(POLL_S, self._job_limit_s / 4))
                 if ready:
                     self._take_in(ready[0], waiting, attempts, on_receipt)
@@ -93,7 +98,7 @@ class RayFleet:
                     return
                 if len(seat.pending) == depth:
                     if seat.actor is None:
-                        seat.actor = self._start()
+                        self._start(seat)
                     if not seat.pending:
                         seat.busy_since = time.monotonic()
                     job = waiting.popleft()
@@ -103,8 +108,8 @@ class RayFleet:
         self, ref: Any, waiting: deque[Job], attempts: Counter[Job], on_receipt: Callable[["Receipt"], None]
     ) -> None:
         """Report the receipt behind `ref`, or see to the failure that it stands for."""
-        seat = next(seat for seat in self._seats if any(ref == pending for pending, _ in seat.pending))
-        job = next(job for pending, job in seat.pending if pending == ref)
+        seat = next(seat for seat in self._seats if seat.pending and ref in (seat.arrival, seat.pending[0][0]))
+        job = seat.pending[0][1]
         try:
             receipt = ray.get(ref)
         except RayActorError as error:
@@ -113,18 +118,23 @@ class RayFleet:
         except RayTaskError as error:
             if isinstance(error.cause, AdaAffordError):
                 raise error.cause from None
-            self._settle(seat, ref)
+            self._settle(seat)
             self._count(job, attempts, describe(error.cause or error))
             waiting.appendleft(job)
             return
-        self._settle(seat, ref)
+        if seat.arrival is not None:
+            seat.arrival, seat.busy_since = None, time.monotonic()
+            return
+        self._settle(seat)
         on_receipt(receipt)
 
     def _replace_hung(self, waiting: deque[Job], attempts: Counter[Job]) -> None:
         """Replace actors whose oldest job is over the limit."""
         for seat in self._seats:
-            if seat.pending and time.monotonic() - seat.busy_since > self._job_limit_s:
-                self._retry(seat, waiting, attempts, f"it took more than {self._job_limit_s:g} s")
+            limit = self._job_limit_s if seat.arrival is None else START_LIMIT_S
+            if seat.pending and time.monotonic() - seat.busy_since > limit:
+                doing = "it" if seat.arrival is None else "the start of its process"
+                self._retry(seat, waiting, attempts, f"{doing} took more than {limit:g} s")
 
     def _retry(self, seat: _Seat, waiting: deque[Job], attempts: Counter[Job], reason: str) -> None:
         """Replace the seat's actor and put its jobs back in front; only the oldest one is to blame."""
@@ -140,14 +150,15 @@ class RayFleet:
             raise JobError(job, reason)
         logger.warning("job %s failed (%s); trying again", job.shard_id, reason)
 
-    def _start(self) -> Any:
-        """A new actor. No restarts by Ray: those would run only `__init__` again, and lose what was in flight."""
-        return ray.remote(num_cpus=1, max_restarts=0)(WorkerActor).remote(self._make_worker)
+    def _start(self, seat: _Seat) -> None:
+        """Seat a new actor. No restarts by Ray: those would run only `__init__` again, and lose what was in flight."""
+        seat.actor = ray.remote(num_cpus=1, max_restarts=0)(WorkerActor).remote(self._make_worker)
+        seat.arrival = seat.actor.arrive.remote()
 
     @staticmethod
-    def _settle(seat: _Seat, ref: Any) -> None:
-        """Strike out one pending job; the next one comes to the head."""
-        seat.pending = deque(pair for pair in seat.pending if pair[0] != ref)
+    def _settle(seat: _Seat) -> None:
+        """Strike out the oldest pending job; the next one comes to the head."""
+        seat.pending.popleft()
         seat.busy_since = time.monotonic()
 
     @staticmethod
@@ -155,5 +166,5 @@ class RayFleet:
         """End the seat's actor and forget what it was given."""
         if seat.actor is not None:
             ray.kill(seat.actor)
-        seat.actor = None
+        seat.actor = seat.arrival = None
         seat.pending.clear()

@@ -35,6 +35,9 @@ class WorkerActor:
         self._worker: WrappedWorker | None = None
         self._loaded: set[int] = set()
 
+    def arrive(self) -> None:
+        """Return, which says that the process is up and has imported what it needs."""
+
     def run(self, plan: Plan, job: Job, policy: "list[ray.ObjectRef[Mapping[str, bytes]]]") -> "Receipt":
         """Execute `job` and return its receipt; arrays never cross.
 

@@ -6,9 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from collector.worker import Receipt
 from shared.errors import StoreError
 from shared.plan import Job, Plan
+
+
+@dataclass(frozen=True, slots=True)
+class FakeReceipt:
+    """The fields of `collector.worker.Receipt`, whose module takes seconds to import in each actor."""
+
+    shard_id: str
+    rollouts: int
+    interactions: int
+    successes: int
+    outcomes: dict[str, int]
+    seconds: dict[str, float]
 
 
 @dataclass
@@ -25,7 +36,7 @@ class FakeWorker:
         with (self.folder / f"pulled-{version}").open("a") as log:
             log.write(f"{os.getpid()}\n")
 
-    def run(self, plan: Plan, job: Job) -> Receipt:
+    def run(self, plan: Plan, job: Job) -> FakeReceipt:
         with (self.folder / "begun").open("a") as log:
             log.write(f"{job.shard_id} {os.getpid()}\n")
         if plan.policy_version:
@@ -40,7 +51,7 @@ class FakeWorker:
             raise StoreError("the store is damaged")
         (self.folder / f"shard-{job.shard_id}").touch()
         rollouts = job.stop - job.start
-        return Receipt(job.shard_id, rollouts, 4 * rollouts, rollouts, {"ok": 4 * rollouts}, {"total": 0.01})
+        return FakeReceipt(job.shard_id, rollouts, 4 * rollouts, rollouts, {"ok": 4 * rollouts}, {"total": 0.01})
 
     def _take(self, name: str) -> bool:
         """Whether to misbehave now."""

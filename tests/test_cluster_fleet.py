@@ -10,11 +10,10 @@ import pytest
 
 from cluster.fleet import Fleet, JobError, WorkerFactory
 from cluster.session import fleets
-from collector.worker import Receipt
 from shared.configuration import CollectionConfig
 from shared.errors import StoreError
 from shared.plan import Job, ObjectRef, Plan, Setting, missing_jobs
-from tests.fake_worker import FakeWorker
+from tests.fake_worker import FakeReceipt, FakeWorker
 
 MakeFleet = Callable[[WorkerFactory], Fleet]
 JOB_LIMIT_S = 4.0
@@ -56,7 +55,7 @@ def jobs(count: int, key: str = "random-v0") -> list[Job]:
 
 
 def run(fleet: Fleet, count: int) -> list[str]:
-    receipts: list[Receipt] = []
+    receipts: list[FakeReceipt] = []
     fleet.run(plan(), jobs(count), receipts.append)
     return sorted(receipt.shard_id for receipt in receipts)
 
@@ -120,7 +119,7 @@ def test_a_dead_actor_is_replaced_and_its_jobs_are_done(ray_fleet: Fleet, tmp_pa
 def test_a_replaced_actor_pulls_the_weights_itself(ray_fleet: Fleet, tmp_path: Path) -> None:
     ray_fleet.load_policy(1, {"weights.safetensors": b"weights 1"})
     (tmp_path / "die-2").write_text("1")
-    done: list[Receipt] = []
+    done: list[FakeReceipt] = []
     ray_fleet.run(plan("aip", 1), jobs(6, "aip-v1"), done.append)
     assert len(done) == 6
 
@@ -134,7 +133,7 @@ def test_a_hung_actor_is_replaced(ray_fleet: Fleet, tmp_path: Path) -> None:
 def test_an_actor_holds_at_most_two_jobs(ray_fleet: Fleet, tmp_path: Path) -> None:
     most = 0
 
-    def watch(receipt: Receipt) -> None:
+    def watch(receipt: FakeReceipt) -> None:
         nonlocal most
         seats = ray_fleet._seats  # type: ignore[attr-defined]
         most = max(most, *(len(seat.pending) for seat in seats))
