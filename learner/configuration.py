@@ -44,6 +44,7 @@ class AapConfig(TrainingConfig):
     """"paper": end to end. "privileged": first an oracle critic that is told the hidden facts; AAP starts from it and
     learns to infer them. An AAP that is already trained is fine-tuned end to end either way."""
     steps: int = Field(250, ge=1)
+    learning_rate: float = Field(3e-3, gt=0)
     batch_rollouts: int = Field(4, ge=1)
     rows_per_rollout: int = Field(32, ge=2)
     """At the most, drawn anew each time."""
@@ -54,7 +55,7 @@ class AapConfig(TrainingConfig):
     proposals: int = Field(100, ge=1)
     top: int = Field(5, ge=1)
     """Best proposals whose mean score is a point's actionability, as published."""
-    affordance_points: int = Field(4, ge=1)
+    affordance_points: int = Field(16, ge=1)
     """Points a rollout and step for the actionability loss."""
     distillation: float = Field(1.0, ge=0)
     """Weight of the loss that draws z to the oracle's; privileged training only."""
