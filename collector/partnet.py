@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from collector import meshes
 from collector.articulation import ArticulatedObject, Body, Joint, Mesh
+from collector.bounds import check_bounds
 from collector.files import ObjectFiles, short
 from collector.urdf import MAX_URDF_BYTES, Shape, Urdf, UrdfJoint, parse_urdf
 from shared.errors import ObjectError
@@ -27,8 +28,6 @@ MAX_TEXT_BYTES = 1 << 20
 MAX_OBJECT_BYTES = 256 << 20
 MAX_OBJECT_VERTICES = 5_000_000
 """Over all shapes: a URDF may show one mesh many times."""
-MAX_PARTS = 255
-"""Observations number parts in one byte."""
 MAX_WORD = 64
 
 URDF_FILE = "mobility.urdf"
@@ -54,10 +53,11 @@ def read_object(folder: Path) -> ArticulatedObject:
     mesh_bytes = _read_meshes(files, urdf)
     content = {URDF_FILE: urdf_bytes, SEMANTICS_FILE: semantics, "category": category.encode(), **mesh_bytes}
     ref = _reference(folder, category, content_hash(content))
-    moving = sum(joint.kind != "fixed" for joint in urdf.joints)
-    if moving > MAX_PARTS:
-        raise ObjectError(f"{folder}: {moving} movable parts; at most {MAX_PARTS} are allowed")
     bodies = _Bodies(urdf, mesh_bytes, _part_names(semantics, folder), folder).merged()
+    try:
+        check_bounds(bodies)
+    except ObjectError as error:
+        raise ObjectError(f"{folder}: {error}") from None
     if not any(body.visuals and body.joint for body in bodies):
         raise ObjectError(f"{folder}: has no movable part that can be seen: its moving links have no mesh")
     return ArticulatedObject(ref, bodies)
