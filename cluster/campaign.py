@@ -141,7 +141,7 @@ class Campaign:
             task=config.task,
             seed=config.seed,
             objects=tuple(sorted(objects, key=lambda ref: ref.id)),
-            collection=config.collection,
+            collection=task_named(config.task).resolve(config.collection),
             evaluation=config.evaluation if evaluation else None,
         )
 

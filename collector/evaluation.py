@@ -67,8 +67,9 @@ def evaluate(
         return seeds.generator(plan.setting.seed, f"{purpose}/{plan.key}", index)
 
     environment = recorder.environment
+    edge_share = plan.setting.collection.rollout.edge_share or 0.0
     start = environment.state()
-    try_from_one_state(recorder, RandomProposer(rng("queries")), config.queries, Role.QUERY)
+    try_from_one_state(recorder, RandomProposer(rng("queries"), edge_share), config.queries, Role.QUERY)
     for name in config.methods:
         if not recorder.sound:
             return
@@ -77,7 +78,7 @@ def evaluate(
         exploiter = make_proposer(method.exploits, rng(f"exploit/{name}"))
         context: Proposer | None = None
         if method.tries == RandomProposer.name:
-            context = RandomProposer(rng(f"context/{name}"))
+            context = RandomProposer(rng(f"context/{name}"), edge_share)
         elif method.tries is not None:
             context = make_proposer(method.tries, rng(f"context/{name}"))
         _adapt(recorder, name, context, exploiter, sorted(config.budgets), clock)

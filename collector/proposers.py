@@ -3,12 +3,20 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from shared.geometry import gripper_rotation
 from shared.vocabulary import Action, Float, Interaction, Observation
 
 LEAST_COSINE = 0.7
 """AdaAfford's random data approaches within about 45 deg of the inward normal: d . n < -0.7."""
+
+EDGE_RADIUS = 0.08
+"""Neighbourhood within which a point's place on its part is judged."""
+EDGE_OFFSET = 0.25
+"""Share of the radius; the centroid of a half disc is 0.42 of its radius away from the middle of its edge, so that
+points up to about a third of the radius from an edge count."""
 
 
 def random_rotation(normal: Float, rng: np.random.Generator) -> Float:
@@ -36,18 +44,49 @@ def _normal_to(axis: Float, rng: np.random.Generator) -> Float:
 
 
 class RandomProposer:
-    """Proposes a random visible point that the task may act on, approached from a random side; never stops."""
+    """Proposes a random visible point that the task may act on, approached from a random side; never stops.
+
+    Args:
+        rng: draws the actions.
+        edge_share: share of the actions at points near a part's edge; the others are anywhere on the movable parts.
+    """
 
     name = "random"
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self, rng: np.random.Generator, edge_share: float = 0.0) -> None:
         self._rng = rng
+        self._edge_share = edge_share
+        self._edges: tuple[Observation, NDArray[np.int64]] | None = None
 
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
         """A random action, or None where nothing that the task may act on is in view."""
         candidates = np.flatnonzero(observation.movable)
         if len(candidates) == 0:
             return None
+        if self._rng.random() < self._edge_share:
+            edges = self._edges_of(observation)
+            candidates = edges if len(edges) else candidates
         index = int(self._rng.choice(candidates))
         rotation = random_rotation(observation.normals[index].astype(np.float64), self._rng)
         return Action(index, observation.points[index].astype(np.float64), rotation)
+
+    def _edges_of(self, observation: Observation) -> NDArray[np.int64]:
+        if self._edges is None or self._edges[0] is not observation:
+            self._edges = observation, edge_points(observation)
+        return self._edges[1]
+
+
+def edge_points(observation: Observation) -> NDArray[np.int64]:
+    """Indices of the movable points that lie near an edge of the visible surface of their part.
+
+    A point inside a patch has its neighbours all around it; near an edge they lie to one side, so that their centroid
+    is away from it.
+    """
+    found = []
+    for part in np.unique(observation.part_ids[observation.movable]):
+        own = np.flatnonzero(observation.part_ids == part)
+        points = observation.points[own].astype(np.float64)
+        for index, point, near in zip(own, points, cKDTree(points).query_ball_point(points, EDGE_RADIUS), strict=True):
+            if np.linalg.norm(points[near].mean(axis=0) - point) > EDGE_OFFSET * EDGE_RADIUS:
+                found.append(index)
+    return np.array(found, dtype=np.int64)

@@ -81,7 +81,7 @@ def collect(
 ) -> None:
     """Training data: what a policy proposes comes first, each try continuing the last; random tries fill the rest."""
     rollout = plan.setting.collection.rollout
-    random = RandomProposer(seeds.generator(plan.setting.seed, f"actions/{plan.key}", index))
+    random = RandomProposer(seeds.generator(plan.setting.seed, f"actions/{plan.key}", index), rollout.edge_share or 0.0)
     environment = recorder.environment
     if plan.proposer != RandomProposer.name:
         first = environment.state()

@@ -104,6 +104,9 @@ class RolloutConfig(StrictModel):
     """Order of the random interactions; those of AIP always continue, and come first."""
     actions_per_state: int = Field(8, ge=1)
     """Restart order: actions tried from one observed state."""
+    edge_share: float | None = Field(None, ge=0, le=1)
+    """Share of random actions at points near a part's edge, where a gripper finds something to pinch; the rest anywhere
+    on the movable parts, as published. None: the task's own."""
     context: int = Field(4, ge=0)
     """How many interactions, at the most, AIP proposes at the start of a rollout in rounds that use it."""
 

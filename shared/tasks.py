@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from shared.configuration import DynamicsRanges
+from shared.configuration import CollectionConfig, DynamicsRanges
 from shared.errors import UsageError
 from shared.vocabulary import Direction, Primitive
 
@@ -20,6 +20,8 @@ class Task:
         closed: whether every joint starts at its lower limit, instead of the published mixture of states.
         directions: the modes that a rollout's `HiddenDynamics.direction` is drawn from.
         dynamics: ranges of the hidden dynamics.
+        edge_share: share of random actions at points near a part's edge. As published it is 0 throughout; most pulls in
+            the middle of a panel pinch nothing, so that half of them there doubles the positives.
     """
 
     name: str
@@ -30,13 +32,26 @@ class Task:
     closed: bool = False
     directions: tuple[Direction, ...] = (Direction.AS_BUILT,)
     dynamics: DynamicsRanges = DynamicsRanges()
+    edge_share: float = 0.0
+
+    def resolve(self, collection: CollectionConfig) -> CollectionConfig:
+        """`collection` with what it leaves to the task filled in, so that a store says all that was decided."""
+        rollout = collection.rollout
+        share = self.edge_share if rollout.edge_share is None else rollout.edge_share
+        return collection.model_copy(
+            update={
+                "primitive": collection.primitive or self.primitive,
+                "dynamics": collection.dynamics or self.dynamics,
+                "rollout": rollout.model_copy(update={"edge_share": share}),
+            }
+        )
 
 
 TASKS = {
     task.name: task
     for task in (
         Task("push", Primitive.PUSH),
-        Task("pull", Primitive.PULL),
+        Task("pull", Primitive.PULL, edge_share=0.5),
         Task(
             "pull-closed-door",
             Primitive.PULL,
@@ -44,6 +59,7 @@ TASKS = {
             part_names=("door",),
             revolute_only=True,
             closed=True,
+            edge_share=0.5,
         ),
         Task(
             "push-faucet",

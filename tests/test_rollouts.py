@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from collector.articulation import ArticulatedObject
+from collector.camera import EmbreeCamera, observation_from
 from collector.catalogue import for_task, load_ref, scan
 from collector.clock import StageClock
 from collector.draws import draw_rollout, object_of
@@ -14,18 +15,21 @@ from collector.environment import draw_state
 from collector.evaluation import method_named
 from collector.primitives import Trial
 from collector.procedural import generate
-from collector.proposers import LEAST_COSINE, RandomProposer, random_rotation
+from collector.proposers import LEAST_COSINE, RandomProposer, edge_points, random_rotation
 from collector.rollout import run_rollout
 from collector.scene import Scene
 from collector.worker import Worker
 from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import ObjectError, UsageError
+from shared.geometry import camera_pose
 from shared.plan import EvaluationConfig, Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import Store
 from shared.tasks import task_named
 from shared.vocabulary import Action, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role
+from tests.single_door import door
 
+FRONT = camera_pose(180, 20, 5)
 SMALL = CollectionConfig(
     camera=CameraConfig(image_size=128, points=256, candidates=1000),
     rollout=RolloutConfig(interactions=6, actions_per_state=3, context=2),
@@ -199,6 +203,21 @@ def test_random_approaches_stay_within_their_cap_and_fill_it() -> None:
     assert cosines.min() >= LEAST_COSINE - 1e-9
     assert cosines.mean() == pytest.approx((1 + LEAST_COSINE) / 2, abs=0.01)
     assert np.abs(rotations[:, :, 0].mean(axis=0)).max() < 0.15
+
+
+def test_edges_are_found_where_the_part_ends() -> None:
+    image = EmbreeCamera(door(), FRONT, CameraConfig()).capture(np.zeros(1))
+    cloud = observation_from(image, FRONT, (1,), CameraConfig(), np.random.default_rng(0))
+    assert cloud is not None
+    edges = edge_points(cloud)
+    assert cloud.movable[edges].all()
+    to_edge = 0.3 - np.abs(cloud.points[:, 1:]).max(axis=1)
+    assert to_edge[edges].max() < 0.05
+    inner = np.flatnonzero(cloud.movable & (to_edge < 0.01))
+    assert np.isin(inner, edges).mean() > 0.9
+    proposer = RandomProposer(np.random.default_rng(0), edge_share=1.0)
+    proposed = [proposer.propose(cloud, ()) for _ in range(50)]
+    assert all(action is not None and action.point_index in edges for action in proposed)
 
 
 def test_an_unknown_method_is_refused_with_those_there_are() -> None:

@@ -87,7 +87,7 @@ def _collect(command: CollectCommand) -> None:
         task=chosen.task,
         seed=chosen.seed,
         objects=tuple(entry.ref for entry in catalogue.usable),
-        collection=chosen.collection,
+        collection=task_named(chosen.task).resolve(chosen.collection),
     )
     store = Store.create(path, setting)
     plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
