@@ -22,6 +22,7 @@ COMMANDS = {
     "collect": "collect interactions into a store, without any learning",
     "store": "info, verify, digest or replay: look into a store",
     "objects": "generate, check or preview: the objects",
+    "bench": "fidelity, dynamics or collect: measure collection, and what its data are worth",
     "version": "print the version",
 }
 """Subcommands, each a module of `cluster.commands` with `main(args) -> int`."""

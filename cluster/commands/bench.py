@@ -1,0 +1,222 @@
+"""`adaafford bench`: measure collection, and what its data are worth."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from pydantic import Field
+
+from cluster.settings import parse_flags
+from shared.configuration import FIDELITIES, CollectionConfig, Fidelity, StrictModel
+from shared.errors import UsageError
+from shared.tasks import task_named
+from shared.vocabulary import Primitive
+
+if TYPE_CHECKING:
+    from shared.plan import Plan
+
+ACTIONS = ("fidelity", "dynamics", "collect")
+
+
+class BenchSettings(StrictModel):
+    """What every benchmark may be told."""
+
+    task: str = "push"
+    """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
+    objects: Path | None = None
+    """A folder of objects in PartNet-Mobility's layout; built-in procedural objects where none is given."""
+    primitive: Primitive | None = None
+    """Instead of the task's own primitive."""
+    seed: int = Field(1, ge=0, lt=2**63)
+    """Everything random derives from it."""
+    procedural_per_category: int = Field(2, ge=1, le=10_000)
+    """Built-in objects: how many of each category that the task applies to."""
+    as_json: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(name="json")] = False
+    """Print one JSON object as the last line."""
+    out: Path | None = None
+    """A folder that also gets the result as a file, with date, hardware and versions."""
+    collection: CollectionConfig = CollectionConfig()
+
+
+class FidelitySettings(BenchSettings):
+    """Of `adaafford bench fidelity`."""
+
+    trials: int = Field(200, ge=1, le=1_000_000)
+    """How many."""
+    reference: Fidelity = FIDELITIES["reference"]
+    """The truth: the published timing."""
+    candidate: Fidelity = FIDELITIES["fast"]
+    """What is judged: what collection uses by default."""
+
+
+class DynamicsSettings(BenchSettings):
+    """Of `adaafford bench dynamics`."""
+
+    rollouts: int = Field(60, ge=1, le=1_000_000)
+    """One object and one state each."""
+    draws: int = Field(6, ge=2, le=1000)
+    """Of hidden dynamics, under which every (state, action) pair is tried."""
+    actions: int = Field(6, ge=1, le=1000)
+    """Tried from each state."""
+
+
+class CollectSettings(BenchSettings):
+    """Of `adaafford bench collect`."""
+
+    rollouts: int = Field(30, ge=1, le=1_000_000)
+    """Of each repeat."""
+    repeats: int = Field(3, ge=1, le=1000)
+    """The median of these counts."""
+    sample: int = Field(9, ge=1, le=10_000)
+    """Trials by the published protocol in all: a process and a scene each, a few seconds."""
+    workers: int = Field(1, ge=1, le=256)
+    """With more than one, the speed-up of a Ray fleet over one worker is measured as well."""
+
+
+@dataclass(frozen=True, slots=True)
+class FidelityCommand:
+    """Execute the same trials in two fidelities, and say how far they agree."""
+
+    settings: Annotated[FidelitySettings, tyro.conf.arg(name="")] = FidelitySettings()
+
+
+@dataclass(frozen=True, slots=True)
+class DynamicsCommand:
+    """Say how often random actions succeed, and how often the same action hangs on the hidden dynamics."""
+
+    settings: Annotated[DynamicsSettings, tyro.conf.arg(name="")] = DynamicsSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class CollectCommand:
+    """Time what users run, and beside it the published protocol on a sample of the same trials."""
+
+    settings: Annotated[CollectSettings, tyro.conf.arg(name="")] = CollectSettings()
+
+
+def main(args: list[str]) -> int:
+    """Dispatch."""
+    match args[:1]:
+        case ["fidelity"]:
+            return _fidelity(parse_flags(FidelityCommand, args[1:], "bench fidelity").settings)
+        case ["dynamics"]:
+            return _dynamics(parse_flags(DynamicsCommand, args[1:], "bench dynamics").settings)
+        case ["collect"]:
+            return _collect(parse_flags(CollectCommand, args[1:], "bench collect").settings)
+        case ["-h" | "--help"]:
+            print(f"usage: adaafford bench {{{','.join(ACTIONS)}}}; `adaafford bench fidelity --help` tells more")
+            return 0
+    given = f"'{args[0]}'" if args else "nothing"
+    raise UsageError(f"bench needs one of {', '.join(ACTIONS)}; given {given}")
+
+
+def _fidelity(command: FidelitySettings) -> int:
+    from cluster.benchmarks.fidelity import compare
+    from cluster.benchmarks.progress import progress
+
+    with _planned(command) as (plan, folder), progress(f"trials, {command.task}", command.trials) as advance:
+        result = compare(plan, folder, command.reference, command.candidate, command.trials, advance)
+    print(f"{result.trials} trials on {result.objects} objects, {result.positives} positives in the reference")
+    print(f"  label agreement   {result.label_agreement:.1%}")
+    print(f"  F1 of positives   {result.positive_f1:.3f}")
+    print(f"  kind agreement    {result.kind_agreement:.1%}")
+    print(f"  error of m        {result.motion_error_median:.2g} median, {result.motion_error_p95:.2g} at 95%")
+    print(f"  CPU ms a trial    {result.reference_ms:.1f} {command.reference.name}, ", end="")
+    print(f"{result.candidate_ms:.1f} {command.candidate.name}")
+    for change, count in result.confusions:
+        print(f"  {count:>4} x {change}")
+    fidelities = {"reference": command.reference.model_dump(), "candidate": command.candidate.model_dump()}
+    return _finish(command, "fidelity", result.as_json() | fidelities)
+
+
+def _dynamics(command: DynamicsSettings) -> int:
+    from cluster.benchmarks.dynamics import ALL, measure
+    from cluster.benchmarks.progress import progress
+
+    with _planned(command) as (plan, folder), progress(f"rollouts, {command.task}", command.rollouts) as advance:
+        found = measure(plan, folder, command.rollouts, command.draws, command.actions, advance)
+    print(f"{'category':<18}{'trials':>7}{'success':>9}{'pairs':>7}{'ever':>6}{'depends on draw':>17}  outcomes")
+    for name, figures in found.items():
+        outcomes = ", ".join(f"{kind} {share:.0%}" for kind, share in figures.outcomes.items())
+        print(
+            f"{name:<18}{figures.trials:>7}{figures.base_rate:>9.1%}{figures.pairs:>7}{figures.ever:>6}"
+            f"{figures.depends_share:>17.1%}  {outcomes}"
+        )
+    categories = {name: figures.as_json() for name, figures in found.items() if name != ALL}
+    told = {"draws": command.draws, "edge_share": plan.setting.collection.rollout.edge_share, "categories": categories}
+    return _finish(command, "dynamics", found[ALL].as_json() | told)
+
+
+def _collect(command: CollectSettings) -> int:
+    from cluster.benchmarks.collecting import CollectionBenchmark
+    from cluster.benchmarks.progress import progress
+
+    with _planned(command) as (plan, folder):
+        benchmark = CollectionBenchmark(plan, folder, command.rollouts, command.repeats, command.sample)
+        with progress(f"jobs and published trials, {command.task}", benchmark.steps) as advance:
+            benchmark.run(advance)
+        result = benchmark.as_json()
+        if command.workers > 1:
+            from cluster.benchmarks.speedup import speedup
+
+            with progress(f"turns of 1 and {command.workers} workers", 2 * command.repeats + 2) as advance:
+                result |= speedup(plan, folder, command.rollouts, command.repeats, command.workers, advance)
+    _print_collect(result)
+    return _finish(command, "collect", result)
+
+
+def _print_collect(result: dict[str, Any]) -> None:
+    interactions, published = result["interactions"], result["published_stage_seconds"]
+    print(f"{interactions} interactions, {result['repeats']} times; medians of these")
+    print(f"  interactions a core-second    {result['interactions_per_core_second']:.1f}")
+    print(f"  interactions a second         {result['interactions_per_wall_second']:.1f} (one worker)")
+    stages = result["stage_seconds"].items()
+    print(f"  ms an interaction             {', '.join(f'{n} {1e3 * s / interactions:.2f}' for n, s in stages)}")
+    print(f"  bytes an interaction          {result['bytes_per_interaction']:.0f}")
+    print(f"published protocol, {result['published_trials']} of the same trials")
+    print(f"  core-seconds a trial          {result['published_core_seconds_per_trial']:.2f}")
+    parts = ("start", "load", "settle", "trial")
+    print(f"  of these                      {', '.join(f'{name} {published[name]:.2f}' for name in parts)}")
+    print(f"  same label as stored          {result['published_label_agreement']:.0%}")
+    print(f"times the published protocol    {result['times_published_protocol']:.0f}")
+    short = result["times_published_protocol_with_short_settling"]
+    print(f"  with AdaAfford's settling     {short:.0f} (150 still steps of at most 200, not 5,000 of 20,000)")
+    if "workers" in result:
+        same = "the same content" if result["same_digest"] else "OTHER CONTENT"
+        print(f"{result['workers']} workers                       {result['workers_speedup']:.2f} times one; {same}")
+
+
+@contextmanager
+def _planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
+    """A plan of random interactions, and the folder of its objects; built-in objects last as long as the context."""
+    task = task_named(command.task)
+    from cluster.objects import objects_for
+    from shared.plan import Plan, Setting
+
+    own = {} if command.primitive is None else {"primitive": command.primitive}
+    config = task.resolve(command.collection.model_copy(update=own))
+    with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
+        built_in = Path(scratch) / "objects"
+        catalogue, folder = objects_for(task, command.objects, built_in, command.procedural_per_category, command.seed)
+        refs = tuple(entry.ref for entry in catalogue.usable)
+        yield Plan(setting=Setting(task=task.name, seed=command.seed, objects=refs, collection=config)), folder
+
+
+def _finish(command: BenchSettings, name: str, result: dict[str, Any]) -> int:
+    """Keep and print the result."""
+    from cluster.benchmarks.results import as_line, keep
+
+    objects = "built-in" if command.objects is None else command.objects.name
+    result |= {"benchmark": name, "task": command.task, "objects_from": objects, "seed": command.seed}
+    if command.primitive is not None:
+        result["primitive"] = command.primitive.value
+    if command.out is not None:
+        what = command.task if command.primitive is None else f"{command.task}-as-{command.primitive.value}"
+        print(f"kept in {keep(result, command.out, f'{name}-{what}-{objects}')}")
+    if command.as_json:
+        print(as_line(result))
+    return 0
