@@ -69,7 +69,7 @@ def evaluate(
     environment = recorder.environment
     edge_share = plan.setting.collection.rollout.edge_share or 0.0
     start = environment.state()
-    try_from_one_state(recorder, RandomProposer(rng("queries"), edge_share), config.queries, Role.QUERY)
+    try_from_one_state(recorder, RandomProposer(rng("queries"), edge_share), config.queries, Role.QUERY, clock)
     for name in config.methods:
         if not recorder.sound:
             return

@@ -106,14 +106,15 @@ def try_repeatedly(
         history.append(recorder.try_action(action, proposer.name, Order.CONTINUE, role, method))
 
 
-def try_from_one_state(recorder: Recorder, proposer: Proposer, count: int, role: Role) -> None:
+def try_from_one_state(recorder: Recorder, proposer: Proposer, count: int, role: Role, clock: StageClock) -> None:
     """Several actions from the environment's present state, which is put back before each and in the end."""
     environment = recorder.environment
     observation = environment.observe()
     state = environment.state()
     for _ in range(count):
         environment.restore(state)
-        action = proposer.propose(observation, ())
+        with clock.stage("propose"):
+            action = proposer.propose(observation, ())
         if action is None:
             return
         recorder.try_action(action, proposer.name, Order.RESTART, role)

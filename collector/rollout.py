@@ -95,7 +95,8 @@ def collect(
     while recorder.sound and (left := rollout.interactions - len(recorder.interactions)) > 0:
         one_state = environment.task.closed  # Every draw of a state would give the same one.
         before = len(recorder.interactions)
-        try_from_one_state(recorder, random, left if one_state else min(left, rollout.actions_per_state), Role.COLLECT)
+        count = left if one_state else min(left, rollout.actions_per_state)
+        try_from_one_state(recorder, random, count, Role.COLLECT, clock)
         if one_state or not recorder.sound or not _next_state(environment, states):
             break
         assert len(recorder.interactions) > before, "a state without targets is never used"
