@@ -92,7 +92,7 @@ class Trial:
         self.primitive = primitive
         self.fidelity = fidelity
         self.steps = 0
-        self._touched = False
+        self._checked = False
         self._brushed = False
         self._hand_at = np.zeros(3)
         self._opening = float("nan")
@@ -106,7 +106,7 @@ class Trial:
         scene.gripper.place(self.action.rotation, hand_start(self.action), FINGER_OPEN * self.primitive.pulls)
         try:
             self._execute()
-            kind = OutcomeKind.OK if self._touched or self._brushed else OutcomeKind.NO_CONTACT
+            kind = OutcomeKind.OK if self._brushed else OutcomeKind.NO_CONTACT
         except _TrialEndedError as ended:
             kind = ended.kind
         end = scene.joint_positions()[self.target - 1]
@@ -189,23 +189,24 @@ class Trial:
     def _step(self) -> None:
         self.scene.system.step()
         self.steps += 1
-        if not self._touched:
+        if not self._checked:
             self._check_first_contact()
 
     def _check_first_contact(self) -> None:
-        """The published first-contact rule; checking ends with the first valid contact."""
+        """The published first-contact rule; checking ends with the first valid contact.
+
+        Only a push can go wrong after the first step, so a pull is checked no longer than until it touches anything.
+        """
         contact = self.scene.contact()
         self._brushed = self._brushed or contact.brushes
-        if not contact.any:
-            return
-        if self.steps == 1:
-            raise _TrialEndedError(OutcomeKind.START_COLLISION)
-        if not self.primitive.pulls:
-            if contact.palm:
+        if contact.presses:
+            if self.steps == 1:
+                raise _TrialEndedError(OutcomeKind.START_COLLISION)
+            if not self.primitive.pulls and contact.palm:
                 raise _TrialEndedError(OutcomeKind.HAND_CONTACT)
-            if contact.finger_on - {self.target}:
+            if not self.primitive.pulls and contact.finger_on - {self.target}:
                 raise _TrialEndedError(OutcomeKind.WRONG_PART)
-        self._touched = True
+        self._checked = contact.presses or (self.primitive.pulls and contact.brushes)
 
     def _succeeded(self, start: float, end: float, displacement: Float) -> bool:
         low, high = self.scene.limits[self.target - 1]

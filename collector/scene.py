@@ -45,7 +45,7 @@ class Contact:
     clearance: float
 
     @property
-    def any(self) -> bool:
+    def presses(self) -> bool:
         """Whether the hand presses on anything."""
         return self.palm or bool(self.finger_on)
 
