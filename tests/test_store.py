@@ -440,3 +440,14 @@ def test_documents_are_read_by_people(tmp_path: Path) -> None:
     document = json.loads((store.path / "store.json").read_text())
     assert document["setting"]["task"] == "push"
     assert document["software"]["zarr"]
+
+
+def test_a_plan_written_before_a_setting_existed_is_still_the_same_plan(tmp_path: Path) -> None:
+    setting = fabricate_setting()
+    store, plan = Store.create(tmp_path / "store", setting), Plan(setting=setting)
+    older = plan.model_dump(mode="json")
+    del older["setting"]["collection"]["fidelity"]["end_holds_at_rest"]
+    (tmp_path / "store" / "plans").mkdir()
+    (tmp_path / "store" / "plans" / f"{plan.key}.json").write_bytes(seal(older))
+    store.add_plan(plan)
+    assert store.plans() == (plan,)

@@ -36,7 +36,7 @@ from shared.store.layout import (
 )
 from shared.store.observations import ObservationArrays
 from shared.store.provenance import software_versions
-from shared.store.sealed import canonical, parse_object, seal
+from shared.store.sealed import seal, unseal
 from shared.store.tables import INTERACTION_SCHEMA, ROLLOUT_SCHEMA
 from shared.store.writer import commit_shard
 
@@ -106,11 +106,11 @@ class Store:
             raise StoreError(f"{self.path}: plan {plan.key} is of another setting: {difference}")
         file = self._plans / f"{plan.key}.json"
         self._plans.mkdir(exist_ok=True)
-        data = canonical(plan.model_dump(mode="json"))
-        if not file.exists() and create_exclusively(file, data):
+        if not file.exists() and create_exclusively(file, seal(plan.model_dump(mode="json"))):
             return
-        if read_bounded(file, MAX_DOCUMENT_BYTES) != data:
-            raise StoreError(f"{file}: holds another plan of this name, or is damaged; restore it from a copy")
+        # Compared as plans: a setting that came with later software has its default in a file that lacks it.
+        if self.read_plan(file) != plan:
+            raise StoreError(f"{file}: holds another plan of this name; give this one another store")
 
     def plans(self) -> tuple[Plan, ...]:
         """The plans, in order of name.
@@ -129,11 +129,10 @@ class Store:
         """
         data = read_bounded(file, MAX_DOCUMENT_BYTES)
         try:
-            plan = Plan.model_validate(parse_object(data, str(file)))
+            plan = Plan.model_validate(unseal(data, str(file)))
         except ValidationError:
             raise StoreError(f"{file}: is no plan; the file is damaged or foreign") from None
-        sound = plan.key == file.stem and plan.setting == self.setting
-        if not sound or canonical(plan.model_dump(mode="json")) != data:
+        if plan.key != file.stem or plan.setting != self.setting:
             raise StoreError(f"{file}: is no plan of this store; the file is damaged or foreign")
         return plan
 
