@@ -244,3 +244,12 @@ def test_a_rollout_ends_where_the_simulation_diverges(objects: Path, monkeypatch
     monkeypatch.setattr(Trial, "run", run)
     record = rollout(plan_for(objects), objects)
     assert [row.outcome.kind for row in record.interactions] == [OutcomeKind.OK, OutcomeKind.UNSTABLE]
+
+
+def test_a_setting_says_what_it_left_to_the_task() -> None:
+    task = task_named("pull-closed-door")
+    resolved = task.resolve(SMALL)
+    assert (resolved.primitive, resolved.dynamics, resolved.rollout.edge_share) == (task.primitive, task.dynamics, 0.5)
+    told = SMALL.model_copy(update={"rollout": RolloutConfig(edge_share=0.0)})
+    assert task.resolve(told).rollout.edge_share == 0.0
+    assert task.resolve(resolved) == resolved
