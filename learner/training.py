@@ -1,4 +1,4 @@
-"""The training loop that all stages share: Adam, a decaying rate, validation, checkpoints and a line of progress.
+"""The training loop that all stages share: Adam, a decaying rate, validation, checkpoints and a word of progress.
 
 Every step draws its randomness from the seed, the stage's name and its own number, so that a run that was killed and
 resumed gives the same bits as one that was not (on one kind of CPU, with one number of threads).
@@ -6,7 +6,6 @@ resumed gives the same bits as one that was not (on one kind of CPU, with one nu
 
 import json
 import math
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,12 +14,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 
 from learner.checkpoint import Cursor, read_checkpoint, write_checkpoint
 from learner.configuration import TrainingConfig
+from learner.progress import ProgressReport, Standing
 from shared.errors import UsageError
 from shared.seeds import generator
 
@@ -76,7 +74,9 @@ class TrainingResult:
     """Validation figures of the best weights."""
 
 
-def train(stage: Stage, config: TrainingConfig, seed: int, out: Path, fingerprint: str = "") -> TrainingResult:
+def train(
+    stage: Stage, config: TrainingConfig, seed: int, out: Path, fingerprint: str = "", title: str = ""
+) -> TrainingResult:
     """Train a stage, from its last checkpoint in `out` where there is one.
 
     Args:
@@ -85,12 +85,13 @@ def train(stage: Stage, config: TrainingConfig, seed: int, out: Path, fingerprin
         seed: of all randomness.
         out: an existing folder for the checkpoint and the metrics.
         fingerprint: of everything that the result depends on; a checkpoint with another one is refused.
+        title: what lines of progress call it; the stage's name where none is given.
 
     Raises:
         UsageError: the checkpoint is of another run, or the loss is not finite.
         StoreError: the checkpoint is damaged.
     """
-    return _Loop(stage, config, seed, out, fingerprint).run()
+    return _Loop(stage, config, seed, out, fingerprint).run(title or stage.name)
 
 
 class _Loop:
@@ -106,28 +107,26 @@ class _Loop:
         )
         self.cursor = Cursor(fingerprint=fingerprint)
         self.best = {name: tensor.clone() for name, tensor in stage.module.state_dict().items()}
+        self._loss = math.nan
         self._resume()
         self._saved_at = time.monotonic()
 
-    def run(self) -> TrainingResult:
+    def run(self, title: str) -> TrainingResult:
         """Step until the steps, the seconds or the patience are used up."""
-        console = Console(stderr=True)
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-        )
-        with Progress(*columns, TimeRemainingColumn(), console=console, disable=not sys.stderr.isatty()) as progress:
-            task = progress.add_task(self.stage.name, total=self.config.steps, rate="", completed=self.cursor.step)
+        with ProgressReport(title, self.config.steps, self.config.seconds, self.cursor.step) as report:
             while not self._finished():
                 self._step()
-                rate = self.cursor.interactions / max(self.cursor.seconds, 1e-9)
-                progress.update(task, completed=self.cursor.step, rate=f"{rate:,.0f} interactions/s")
+                report.update(self._standing())
+        report.finish(self._standing(), self.cursor.best_step)
         self.stage.module.load_state_dict(self.best)
         self.stage.module.eval()
         cursor = self.cursor
         return TrainingResult(cursor.step, cursor.best_step, cursor.seconds, cursor.interactions, cursor.best_metrics)
+
+    def _standing(self) -> Standing:
+        cursor = self.cursor
+        best = cursor.best_score if cursor.best_metrics else None
+        return Standing(cursor.step, self._loss, cursor.interactions, cursor.seconds, best)
 
     def _finished(self) -> bool:
         spent = self.config.seconds is not None and self.cursor.seconds >= self.config.seconds
@@ -142,7 +141,8 @@ class _Loop:
         self.stage.module.train()
         result = self.stage.loss(generator(self.seed, f"learner.{self.stage.name}", step))
         total = torch.stack(list(result.losses.values())).sum()
-        if not math.isfinite(total.item()):
+        self._loss = total.item()
+        if not math.isfinite(self._loss):
             raise UsageError(f"{self.stage.name}: the loss is not finite at step {step}; lower learning_rate")
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
