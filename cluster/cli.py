@@ -21,7 +21,7 @@ COMMANDS = {
     "report": "print a run's results again",
     "collect": "collect interactions into a store, without any learning",
     "store": "info, verify, digest or replay: look into a store",
-    "objects": "generate, check or preview: the objects",
+    "objects": "generate, check, preview or decompose: the objects",
     "bench": "fidelity, dynamics or collect: measure collection, and what its data are worth",
     "version": "print the version",
 }

@@ -12,8 +12,10 @@ from typing import Literal
 import numpy as np
 
 from collector.articulation import ArticulatedObject
+from collector.decomposition import Decomposer, cache_folder
 from collector.files import short
 from collector.partnet import URDF_FILE, read_object
+from shared.configuration import Collision
 from shared.errors import ObjectError, UsageError
 from shared.plan import ObjectRef
 from shared.seeds import generator
@@ -119,13 +121,22 @@ def load(entry: CatalogueEntry) -> ArticulatedObject:
     return _load(entry.folder, entry.ref)
 
 
-def load_ref(path: Path, ref: ObjectRef) -> ArticulatedObject:
+def load_ref(path: Path, ref: ObjectRef, collision: Collision = "hulls") -> ArticulatedObject:
     """The object `ref` below `path`, which is what `scan` was given: a folder of objects, or the object's own.
 
+    Args:
+        path: the folder.
+        ref: which object.
+        collision: whether its collision meshes are taken as they are, or decomposed first.
+
     Raises:
-        ObjectError: there is none, or its files are not those that `ref` was made from.
+        ObjectError: there is none, its files are not those that `ref` was made from, or it cannot be decomposed.
     """
-    return _load(path if (path / URDF_FILE).is_file() else path / ref.id, ref)
+    loaded = _load(path if (path / URDF_FILE).is_file() else path / ref.id, ref)
+    if collision == "hulls":
+        return loaded
+    with Decomposer(cache_folder()) as decomposer:
+        return decomposer.decomposed(loaded)
 
 
 def for_task(catalogue: Catalogue, task: Task) -> Catalogue:

@@ -87,7 +87,7 @@ class Worker:
             if len(self._objects) >= CACHED_OBJECTS:
                 self._objects.pop(next(iter(self._objects)))
             with clock.stage("load"):
-                self._objects[ref.id] = load_ref(self._folder, ref)
+                self._objects[ref.id] = load_ref(self._folder, ref, plan.setting.collection.collision)
         return self._objects[ref.id]
 
     def _proposer(self, plan: Plan, name: str, rng: np.random.Generator) -> Proposer:

@@ -3,7 +3,7 @@
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -11,6 +11,8 @@ from shared.errors import UsageError
 from shared.vocabulary import Order, Primitive
 
 MAX_CONFIGURATION_BYTES = 1 << 20
+
+Collision = Literal["hulls", "decomposed"]
 
 
 class StrictModel(BaseModel):
@@ -50,6 +52,8 @@ class CameraConfig(StrictModel):
     """N, kept by furthest-point sampling. As published: 10,000."""
     candidates: int = Field(30_000, ge=64)
     """Hit pixels drawn at random before furthest-point sampling, as published."""
+    renderer: Literal["embree", "sapien"] = "embree"
+    """Who renders: Embree on the CPU, or SAPIEN's own renderer, which needs a Vulkan device."""
 
     @model_validator(mode="after")
     def _enough_candidates(self) -> "CameraConfig":
@@ -118,6 +122,8 @@ class CollectionConfig(StrictModel):
     """Instead of the task's own primitive."""
     camera: CameraConfig = CameraConfig()
     fidelity: Fidelity = Fidelity()
+    collision: Collision = "hulls"
+    """What objects collide as: each mesh's convex hull, which closes cavities, or its convex decomposition."""
     dynamics: DynamicsRanges | None = None
     """Instead of the task's own ranges."""
     rollout: RolloutConfig = RolloutConfig()

@@ -1,4 +1,4 @@
-"""`adaafford objects`: make objects, check them, look at them."""
+"""`adaafford objects`: make objects, check them, look at them, decompose them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from pydantic import Field
 from cluster.settings import parse_flags
 from shared.errors import UsageError
 
-ACTIONS = ("generate", "check", "preview")
+ACTIONS = ("generate", "check", "preview", "decompose")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +49,14 @@ class PreviewCommand:
     """Objects drawn, at the most."""
 
 
+@dataclass(frozen=True, slots=True)
+class DecomposeCommand:
+    """Decompose collision meshes into convex pieces, once and for all, for `--collection.collision decomposed`."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A folder of objects, or one object's folder."""
+
+
 def main(args: list[str]) -> int:
     """Dispatch."""
     match args[:1]:
@@ -58,6 +66,8 @@ def main(args: list[str]) -> int:
             return _check(parse_flags(CheckCommand, args[1:], "objects check"))
         case ["preview"]:
             return _preview(parse_flags(PreviewCommand, args[1:], "objects preview"))
+        case ["decompose"]:
+            return _decompose(parse_flags(DecomposeCommand, args[1:], "objects decompose"))
         case ["-h" | "--help"]:
             print(f"usage: adaafford objects {{{','.join(ACTIONS)}}} PATH; `adaafford objects check --help` tells more")
             return 0
@@ -99,6 +109,36 @@ def _preview(command: PreviewCommand) -> int:
     contact_sheet([load(entry) for entry in shown], command.out)
     print(f"{command.out}: {len(shown)} of {len(usable)} usable objects")
     return 0
+
+
+def _decompose(command: DecomposeCommand) -> int:
+    from rich.progress import Progress, TaskID
+
+    from collector.catalogue import load, scan
+    from collector.decomposition import Decomposer, cache_folder
+    from shared.errors import ObjectError
+
+    usable, failed = scan(command.path).usable, 0
+    with Decomposer(cache_folder()) as decomposer, Progress(transient=True) as bar:
+        for number, entry in enumerate(usable, start=1):
+            task = bar.add_task(f"{entry.ref.id} ({number} of {len(usable)})", total=None)
+
+            def show(done: int, total: int, task: TaskID = task) -> None:
+                bar.update(task, completed=done, total=total)
+
+            try:
+                target = load(entry)
+                opened = decomposer.decomposed(target, show)
+            except ObjectError as error:
+                failed += 1
+                bar.console.print(f"{entry.ref.id}  refused: {error}", markup=False, highlight=False, soft_wrap=True)
+            else:
+                meshes, pieces = (sum(len(body.collisions) for body in o.bodies) for o in (target, opened))
+                said = f"{entry.ref.id}  {meshes} meshes, {pieces} convex pieces"
+                bar.console.print(said, markup=False, highlight=False, soft_wrap=True)
+            bar.remove_task(task)
+    print(f"{len(usable) - failed} decomposed into {cache_folder()}, {failed} refused")
+    return 0 if failed < len(usable) else UsageError.exit_code
 
 
 def _parts(count: int) -> str:
