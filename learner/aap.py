@@ -11,13 +11,12 @@ from torch import Tensor, nn
 
 from learner.configuration import AapConfig
 from learner.data import Dataset, Split
-from learner.losses import action_scoring_loss, actionability_loss, distillation_loss, top_score
+from learner.losses import action_scoring_loss, distillation_loss
 from learner.metrics import discrimination
 from learner.oracle import OracleCritic
-from learner.sampling import OrderedRows, ProposalPool, draw_numbers, order_rows, spread
+from learner.sampling import OrderedRows, draw_numbers, order_rows, spread
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aap import Aap
-from shared.networks.pointnet2 import EncodedClouds
 
 VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 20
@@ -32,16 +31,14 @@ class Prediction:
     Attributes:
         logits: of the action scores, [B, K + 1, n].
         latents: z of the prefixes, [B, K + 1, latent_width].
-        encoded: the clouds.
     """
 
     logits: Tensor
     latents: Tensor
-    encoded: EncodedClouds
 
 
 class AapStage:
-    """Trains `Aap` (AdaAfford, AAP Action Scoring Loss and AAP Actionability Scoring Loss).
+    """Trains all of `Aap` but D (AdaAfford, AAP Action Scoring Loss).
 
     A random subset of a rollout's interactions is the context; all rows that are not in it are predicted, after each of
     its prefixes and after none. With an oracle, z is drawn to the oracle's as well.
@@ -55,7 +52,6 @@ class AapStage:
         dataset: Dataset,
         parts: Split,
         config: AapConfig,
-        pool: ProposalPool,
         oracle: OracleCritic | None = None,
     ) -> None:
         self.module: nn.Module = aap
@@ -63,20 +59,20 @@ class AapStage:
         self.dataset = dataset
         self.parts = parts
         self.config = config
-        self.pool = pool
         self.oracle = None if oracle is None else oracle.eval().requires_grad_(False)
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """All of AAP; what comes from an oracle moves more slowly."""
+        """All of AAP but D; what comes from an oracle moves more slowly."""
+        trained = [p for name, p in self.aap.named_parameters() if not name.startswith("affordance_head.")]
         if self.oracle is None:
-            return [ParameterGroup(tuple(self.aap.parameters()))]
+            return [ParameterGroup(tuple(trained))]
         inherited = {
             id(p)
             for part in (self.aap.encoder, self.aap.action_encoder, self.aap.critic_head)
             for p in part.parameters()
         }
-        old = tuple(p for p in self.aap.parameters() if id(p) in inherited)
-        new = tuple(p for p in self.aap.parameters() if id(p) not in inherited)
+        old = tuple(p for p in trained if id(p) in inherited)
+        new = tuple(p for p in trained if id(p) not in inherited)
         return [ParameterGroup(new), ParameterGroup(old, self.config.inherited_rate)]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
@@ -89,10 +85,7 @@ class AapStage:
         prediction = predict(self.aap, self.dataset, ordered, context)
         asked = ordered.asked(context)
         success = self.dataset.rows.success[ordered.rows][:, None]
-        losses = {
-            "critic": action_scoring_loss(prediction.logits, success, asked),
-            "affordance": self._actionability_loss(ordered, prediction, rng),
-        }
+        losses = {"critic": action_scoring_loss(prediction.logits, success, asked)}
         if self.oracle is not None:
             told = self._told(ordered)
             losses["distillation"] = config.distillation * distillation_loss(prediction.latents, told, asked.any(-1))
@@ -100,26 +93,24 @@ class AapStage:
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Figures on objects not trained on, before and after the longest context; "score" sums both losses."""
+        """Figures on objects not trained on, before and after the longest context; "score" is over all prefixes."""
         rng = np.random.default_rng(_VALIDATION_SEED)
         rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
         scores: tuple[list[Tensor], list[Tensor]] = ([], [])
-        labels, losses, affordance = [], [], []
+        labels, losses = [], []
         for start in range(0, len(rollouts), _CHUNK):
             ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
             context = ordered.longest_context(self.config.context)
             prediction = predict(self.aap, self.dataset, ordered, context)
             success, asked = self.dataset.rows.success[ordered.rows], ordered.asked(context)
             losses.append(action_scoring_loss(prediction.logits, success[:, None], asked))
-            affordance.append(self._actionability_loss(ordered, prediction, rng))
             asked_last = asked[:, -1]
             for kept, prefix in zip(scores, (0, -1), strict=True):
                 kept.append(torch.sigmoid(prediction.logits[:, prefix][asked_last]))
             labels.append(success[asked_last])
         before, after = (discrimination(torch.cat(kept).numpy(), torch.cat(labels).numpy()) for kept in scores)
         return {
-            "score": float(torch.stack(losses).mean() + torch.stack(affordance).mean()),
-            "affordance": float(torch.stack(affordance).mean()),
+            "score": float(torch.stack(losses).mean()),
             "bce_without_tries": before.bce,
             "bce_with_tries": after.bce,
             "f_without_tries": before.f_score,
@@ -128,26 +119,6 @@ class AapStage:
             "auc_with_tries": after.auc,
             "base_rate": after.base_rate,
         }
-
-    def _actionability_loss(self, ordered: OrderedRows, prediction: Prediction, rng: np.random.Generator) -> Tensor:
-        """L1 to the mean of the best scores that the critic gives to the prior's proposals."""
-        config, aap = self.config, self.aap
-        sets, prefixes = prediction.latents.shape[:2]
-        which = torch.arange(sets).repeat_interleave(config.affordance_points)
-        count = len(which)
-        place = torch.from_numpy(rng.integers(0, ordered.valid.sum(dim=1).numpy()[which.numpy()]))
-        cloud = ordered.cloud[which, place]
-        slot = torch.from_numpy(rng.integers(0, self.pool.point.shape[1], count))
-        latents = prediction.latents[which, torch.from_numpy(rng.integers(0, prefixes, count))].detach()
-        whole_cloud = ordered.clouds[cloud]
-        point = self.pool.point[whole_cloud, slot]
-        frames = self.pool.draw(whole_cloud, slot, config.proposals, rng)
-        with torch.no_grad():
-            features = aap.encoder.at(prediction.encoded, cloud, point)
-            xyz = self.dataset.clouds.points[whole_cloud, point]
-            logits = aap.action_logits(features[:, None], xyz[:, None], frames, latents[:, None])
-            target = top_score(torch.sigmoid(logits), config.top)
-        return actionability_loss(aap.actionability(features, latents), target)
 
     @torch.no_grad()
     def _told(self, ordered: OrderedRows) -> Tensor:
@@ -210,4 +181,4 @@ def predict(aap: Aap, dataset: Dataset, ordered: OrderedRows, context: int) -> P
     )
     latents = aap.prefix_latents(codes, weights)
     xyz, frames = rows.xyz[index][:, None], rows.frame[index][:, None]
-    return Prediction(aap.action_logits(features[:, None], xyz, frames, latents[:, :, None]), latents, encoded)
+    return Prediction(aap.action_logits(features[:, None], xyz, frames, latents[:, :, None]), latents)

@@ -11,16 +11,11 @@ from torch import Tensor, nn
 
 from learner.configuration import AipConfig
 from learner.data import Dataset, Split
-from learner.losses import (
-    action_scoring_losses,
-    actionability_loss,
-    information_gains,
-    information_loss,
-    top_score,
-)
-from learner.sampling import OrderedRows, ProposalPool, draw_numbers, frozen_features, order_rows, spread
+from learner.frozen import FrozenAap
+from learner.losses import action_scoring_losses, information_gains, information_loss
+from learner.metrics import correlation
+from learner.sampling import OrderedRows, draw_numbers, order_rows, spread
 from learner.training import ParameterGroup, StepResult
-from shared.networks.aap import Aap
 from shared.networks.aip import Aip
 from shared.networks.pointnet2 import EncodedClouds
 
@@ -28,37 +23,6 @@ VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 21
 _CHUNK = 4
 """Rollouts validated at once."""
-
-
-@dataclass(frozen=True, slots=True)
-class FrozenAap:
-    """What a frozen AAP makes of every row and pool point, computed once a stage.
-
-    Attributes:
-        aap: frozen.
-        features: f_p|O of the rows, [I, feature_width].
-        pool_features: f_p|O of the pool's points, [O, P, feature_width].
-        codes: z_I of the rows, [I, latent_width].
-        weights: w_I of the rows, [I].
-    """
-
-    aap: Aap
-    features: Tensor
-    pool_features: Tensor
-    codes: Tensor
-    weights: Tensor
-
-    @classmethod
-    @torch.no_grad()
-    def of(cls, aap: Aap, dataset: Dataset, pool: ProposalPool) -> "FrozenAap":
-        """Encode everything."""
-        aap.eval().requires_grad_(False)
-        rows = dataset.rows
-        features = frozen_features(aap.encoder, dataset.clouds, rows.cloud, rows.point)
-        cloud = torch.arange(len(pool.point))[:, None].expand_as(pool.point)
-        pool_features = frozen_features(aap.encoder, dataset.clouds, cloud.flatten(), pool.point.flatten())
-        codes, weights = aap.interaction_codes(features, rows.xyz, rows.frame, rows.motion, rows.success)
-        return cls(aap, features, pool_features.reshape(*pool.point.shape, -1), codes, weights)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +43,7 @@ class Gains:
 
 
 class AipStage:
-    """Trains `Aip` (AdaAfford, AIP Action Scoring Loss and AIP Actionability Scoring Loss); AAP stays as it is.
+    """Trains all of `Aip` but D (AdaAfford, AIP Action Scoring Loss); AAP stays as it is.
 
     The drop of the AAP loss is measured on rows of the same rollout that are no context at all, the same for every
     prefix, so that two losses differ by one try alone.
@@ -87,64 +51,54 @@ class AipStage:
 
     name = "aip"
 
-    def __init__(
-        self, aip: Aip, dataset: Dataset, parts: Split, config: AipConfig, pool: ProposalPool, frozen: FrozenAap
-    ) -> None:
+    def __init__(self, aip: Aip, dataset: Dataset, parts: Split, config: AipConfig, frozen: FrozenAap) -> None:
         self.module: nn.Module = aip
         self.aip = aip
         self.dataset = dataset
         self.parts = parts
         self.config = config
-        self.pool = pool
         self.frozen = frozen
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """All of AIP, at one rate; nothing of AAP."""
-        return [ParameterGroup(tuple(self.aip.parameters()))]
+        """All of AIP but D, at one rate; nothing of AAP."""
+        own = ("actionability_encoder.", "affordance_head.")
+        return [ParameterGroup(tuple(p for name, p in self.aip.named_parameters() if not name.startswith(own)))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
-        """Both losses on a few rollouts, several ordered subsets of each."""
+        """The critic's loss on a few rollouts, several ordered subsets of each."""
         train = self.parts.train
         chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
         ordered = self._order([train[number] for number in chosen], rng)
         found = self.gains(ordered)
         encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
         predicted = self._predict(ordered, found, encoded)
-        losses = {
-            "critic": information_loss(predicted, found.gains, found.mask),
-            "affordance": self._actionability_loss(ordered, found, encoded, rng),
-        }
+        losses = {"critic": information_loss(predicted, found.gains, found.mask)}
         return StepResult(losses, int(ordered.valid.sum()))
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Figures on objects not trained on; "score" sums both losses.
+        """Figures on objects not trained on.
 
-        "critic" is to be compared with "critic_of_median", the loss of a constant.
+        "critic", which is the score, is to be compared with "critic_of_median", the loss of a constant.
         """
         rng = np.random.default_rng(_VALIDATION_SEED)
         rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
-        affordance, kept_gains, kept_guesses = [], [], []
+        kept_gains, kept_guesses = [], []
         for start in range(0, len(rollouts), _CHUNK):
             ordered = self._order(rollouts[start : start + _CHUNK], rng)
             found = self.gains(ordered)
             encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
             kept_guesses.append(self._predict(ordered, found, encoded)[found.mask])
             kept_gains.append(found.gains[found.mask])
-            affordance.append(self._actionability_loss(ordered, found, encoded, rng))
         gains, guesses = torch.cat(kept_gains), torch.cat(kept_guesses)
         everything = torch.ones_like(gains, dtype=torch.bool)
         critic = float(information_loss(guesses, gains, everything))
-        mean_affordance = float(torch.stack(affordance).mean())
-        together = torch.stack([gains, guesses])
-        varied = len(gains) > 1 and bool((together.std(dim=1) > 0).all())
         return {
-            "score": critic + mean_affordance,
+            "score": critic,
             "critic": critic,
-            "affordance": mean_affordance,
             "critic_of_median": float((gains - gains.median()).abs().mean()),
             "mean_gain": float(gains.mean()),
-            "correlation": float(torch.corrcoef(together)[0, 1]) if varied else float("nan"),
+            "correlation": correlation(guesses.numpy(), gains.numpy()),
         }
 
     @torch.no_grad()
@@ -153,7 +107,7 @@ class AipStage:
         frozen, rows = self.frozen, self.dataset.rows
         context = ordered.longest_context(self.config.context)
         tries = ordered.rows[:, :context]
-        latents = frozen.aap.prefix_latents(frozen.codes[tries], frozen.weights[tries])
+        latents = frozen.latents(tries)
         features = frozen.features[ordered.rows][:, None]
         xyz, frames = rows.xyz[ordered.rows][:, None], rows.frame[ordered.rows][:, None]
         logits = frozen.aap.action_logits(features, xyz, frames, latents[:, :, None])
@@ -176,27 +130,3 @@ class AipStage:
         flat = self.aip.encoder.at(encoded, cloud.flatten(), rows.point[tries].flatten())
         features = flat.reshape(*tries.shape, -1)
         return self.aip.action_scores(features, rows.xyz[tries], rows.frame[tries], found.latents, found.scores)
-
-    def _actionability_loss(
-        self, ordered: OrderedRows, found: Gains, encoded: EncodedClouds, rng: np.random.Generator
-    ) -> Tensor:
-        """L1 to the mean of the best AIP scores of the prior's proposals."""
-        config, frozen, aip = self.config, self.frozen, self.aip
-        sets, prefixes = found.latents.shape[:2]
-        count = config.batch_rollouts * config.affordance_points
-        which = rng.integers(0, sets, count)
-        place = torch.from_numpy(rng.integers(0, ordered.valid.sum(dim=1).numpy()[which]))
-        cloud = ordered.cloud[torch.from_numpy(which), place]
-        latents = found.latents[torch.from_numpy(which), torch.from_numpy(rng.integers(0, prefixes, count))]
-        slot = torch.from_numpy(rng.integers(0, self.pool.point.shape[1], count))
-        whole_cloud = ordered.clouds[cloud]
-        point = self.pool.point[whole_cloud, slot]
-        frames = self.pool.draw(whole_cloud, slot, config.proposals, rng)
-        with torch.no_grad():
-            xyz, aap_features = self.dataset.clouds.points[whole_cloud, point], frozen.pool_features[whole_cloud, slot]
-            logits = frozen.aap.action_logits(aap_features[:, None], xyz[:, None], frames, latents[:, None])
-            believed = frozen.aap.actionability(aap_features, latents)
-            features = aip.encoder.at(encoded, cloud, point)
-            scores = aip.action_scores(features[:, None], xyz[:, None], frames, latents[:, None], torch.sigmoid(logits))
-            target = top_score(scores, config.top)
-        return actionability_loss(aip.actionability(features, latents, believed), target)

@@ -27,6 +27,20 @@ class TrainingConfig(StrictModel):
     checkpoint_seconds: float = Field(5.0, ge=0)
 
 
+class AffordanceConfig(TrainingConfig):
+    """An affordance network D, trained when its critic is done."""
+
+    steps: int = Field(400, ge=1)
+    learning_rate: float = Field(3e-3, gt=0)
+    batch_rollouts: int = Field(16, ge=1)
+    points: int = Field(64, ge=1)
+    """Points a step."""
+    context: int = Field(8, ge=0)
+    """The longest context whose z is asked about; AAP and AIP only."""
+    proposals: int = Field(100, ge=1)
+    """Rotations at a point that the critic scores, as published."""
+
+
 class PriorConfig(TrainingConfig):
     """The Where2Act prior."""
 
@@ -34,7 +48,8 @@ class PriorConfig(TrainingConfig):
     actions_per_cloud: int = Field(16, ge=1)
     """At the most; a cloud of a restart rollout has 8."""
     proposals: int = Field(100, ge=1)
-    """Draws a point, for the proposal and for the actionability loss, as published."""
+    """Draws a point for the proposal loss, as published."""
+    affordance: AffordanceConfig = AffordanceConfig()
 
 
 class AapConfig(TrainingConfig):
@@ -52,11 +67,9 @@ class AapConfig(TrainingConfig):
     """The longest context; every shorter one, and none, is trained in the same pass."""
     proposed_first: float = Field(0.5, ge=0, le=1)
     """How often the tries that a policy proposed come first in the context, where a rollout has some."""
-    proposals: int = Field(100, ge=1)
     top: int = Field(5, ge=1)
     """Best proposals whose mean score is a point's actionability, as published."""
-    affordance_points: int = Field(16, ge=1)
-    """Points a rollout and step for the actionability loss."""
+    affordance: AffordanceConfig = AffordanceConfig()
     distillation: float = Field(1.0, ge=0)
     """Weight of the loss that draws z to the oracle's; privileged training only."""
     inherited_rate: float = Field(0.2, ge=0, le=1)
@@ -75,9 +88,8 @@ class AipConfig(TrainingConfig):
     """Tries of an ordered subset; each gives one target."""
     draws: int = Field(4, ge=1)
     """Ordered subsets a rollout and step, which share the encoded clouds."""
-    proposals: int = Field(100, ge=1)
     top: int = Field(5, ge=1)
-    affordance_points: int = Field(4, ge=1)
+    affordance: AffordanceConfig = AffordanceConfig(context=4)
 
 
 class LearnerConfig(StrictModel):

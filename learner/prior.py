@@ -1,6 +1,7 @@
 """Stage 1: the Where2Act prior.
 
-Its proposal network learns from successful orientations, its critic from all rows, its affordance from its critic.
+Its proposal network learns from successful orientations, its critic from all rows; its affordance network follows them
+(see `learner.affordance`).
 """
 
 import numpy as np
@@ -9,19 +10,19 @@ from torch import Tensor, nn
 
 from learner.configuration import PriorConfig
 from learner.data import Dataset, Split
-from learner.losses import action_scoring_loss, actionability_loss, mean_score, proposal_loss
+from learner.losses import action_scoring_loss, proposal_loss
 from learner.metrics import discrimination
 from learner.sampling import draw_numbers, frozen_features, spread
 from learner.training import ParameterGroup, StepResult
 from shared.networks.prior import Prior
 
 VALIDATION_ROWS = 256
-"""Rows of the validation objects that all three losses are measured on."""
+"""Rows of the validation objects that both losses are measured on."""
 _VALIDATION_SEED = 19
 
 
 class PriorStage:
-    """Trains `Prior` (Where2Act): three losses in one pass, each with its own supervision."""
+    """Trains `Prior` (Where2Act): two losses in one pass, each with its own supervision."""
 
     name = "prior"
 
@@ -34,11 +35,12 @@ class PriorStage:
         self._validation = torch.cat([dataset.rollouts[number] for number in parts.validation])
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """All of the prior, at one rate."""
-        return [ParameterGroup(tuple(self.prior.parameters()))]
+        """All of the prior but D, at one rate."""
+        trained = (p for name, p in self.prior.named_parameters() if not name.startswith("affordance_head."))
+        return [ParameterGroup(tuple(trained))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
-        """The three losses on the rows of a few clouds."""
+        """Both losses on the rows of a few clouds."""
         chosen = draw_numbers(len(self._rows_of_cloud), min(self.config.batch_clouds, len(self._rows_of_cloud)), rng)
         most = self.config.actions_per_cloud
         picked = [rng.permutation(self._rows_of_cloud[number])[:most] for number in chosen]
@@ -47,7 +49,7 @@ class PriorStage:
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Figures on objects not trained on; "score" is the sum of the three losses on some of their rows."""
+        """Figures on objects not trained on; "score" is the sum of both losses on some of their rows."""
         scores, success = self.scores(self._validation), self.dataset.rows.success[self._validation]
         losses = self._losses(
             torch.tensor(spread(self._validation.tolist(), VALIDATION_ROWS)), np.random.default_rng(_VALIDATION_SEED)
@@ -60,7 +62,6 @@ class PriorStage:
             "auc": found.auc,
             "base_rate": found.base_rate,
             "proposal": float(losses["proposal"]),
-            "affordance": float(losses["affordance"]),
         }
 
     def _losses(self, index: Tensor, rng: np.random.Generator) -> dict[str, Tensor]:
@@ -68,15 +69,13 @@ class PriorStage:
         clouds, cloud = torch.unique(rows.cloud[index], return_inverse=True)
         features = prior.encoder.at(prior.encoder(self.dataset.clouds.select(clouds)), cloud, rows.point[index])
         xyz, frames, success = rows.xyz[index], rows.frame[index], rows.success[index]
-        shape = (len(index), self.config.proposals, prior.config.noise_width)
+        succeeded = success > 0
+        shape = (int(succeeded.sum()), self.config.proposals, prior.config.noise_width)
         noise = torch.from_numpy(rng.standard_normal(shape).astype(np.float32))
-        proposals = prior.propose(features[:, None], noise)
-        with torch.no_grad():
-            scores = torch.sigmoid(prior.action_logits(features[:, None], xyz[:, None], proposals))
+        proposals = prior.propose(features[succeeded][:, None], noise)
         return {
             "critic": action_scoring_loss(prior.action_logits(features, xyz, frames), success),
-            "proposal": proposal_loss(proposals[success > 0], frames[success > 0]),
-            "affordance": actionability_loss(prior.actionability(features), mean_score(scores)),
+            "proposal": proposal_loss(proposals, frames[succeeded]),
         }
 
     @torch.no_grad()

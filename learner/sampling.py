@@ -17,7 +17,7 @@ from shared.networks.prior import Prior
 
 ENCODING_CHUNK = 16
 """Clouds encoded at once where no gradient is needed; bounds memory."""
-POOL_POINTS = 8
+POOL_POINTS = 16
 """Movable points of each cloud that proposals are drawn at."""
 
 
@@ -107,9 +107,11 @@ class ProposalPool:
             candidates = np.flatnonzero(movable) if movable.any() else np.arange(len(movable))
             chosen.append(rng.choice(candidates, POOL_POINTS))
         point = torch.from_numpy(np.stack(chosen))
-        cloud = torch.arange(len(point))[:, None].expand_as(point)
-        features = frozen_features(prior.encoder, dataset.clouds, cloud.flatten(), point.flatten())
-        return cls(point, features.reshape(*point.shape, -1), prior)
+        return cls(point, _features_of_all(prior.encoder, dataset.clouds, point), prior)
+
+    def features_under(self, encoder: PointNet2, clouds: CloudBatch) -> Tensor:
+        """The points' features under another frozen encoder, [O, P, feature_width]."""
+        return _features_of_all(encoder, clouds, self.point)
 
     @torch.no_grad()
     def draw(self, cloud: Tensor, slot: Tensor, count: int, rng: np.random.Generator) -> Tensor:
@@ -139,6 +141,12 @@ def frozen_features(encoder: PointNet2, clouds: CloudBatch, cloud: Tensor, point
         features[here] = encoder.at(encoded, inverse[here] - start, point[here])
     encoder.train(was_training)
     return features
+
+
+def _features_of_all(encoder: PointNet2, clouds: CloudBatch, point: Tensor) -> Tensor:
+    """Features of the same number of points of every cloud, [O, P] to [O, P, feature_width]."""
+    cloud = torch.arange(len(point))[:, None].expand_as(point)
+    return frozen_features(encoder, clouds, cloud.flatten(), point.flatten()).reshape(*point.shape, -1)
 
 
 def spread(numbers: Sequence[int], most: int) -> list[int]:

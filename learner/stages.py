@@ -4,7 +4,8 @@ OUT/ of a stage
     config.json            what it was told, resolved
     metrics.jsonl          one line a validation
     checkpoint.safetensors until it is done
-    oracle/                privileged AAP only: the same for the oracle critic, and oracle.safetensors
+    affordance/            the last two of the affordance network
+    oracle/                privileged AAP only: the same of the oracle critic, whose weights are in oracle.safetensors
     weights.safetensors    the policy, all three modules
     policy.json
     done.json              written last
@@ -14,7 +15,7 @@ import copy
 import hashlib
 import json
 from collections.abc import Collection
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -22,13 +23,15 @@ import torch
 from safetensors.torch import save
 
 from learner.aap import AapStage, OracleStage
-from learner.aip import AipStage, FrozenAap
-from learner.configuration import LearnerConfig
+from learner.affordance import AapAnswer, AffordanceStage, AipAnswer, Answer, PriorAnswer
+from learner.aip import AipStage
+from learner.configuration import AffordanceConfig, LearnerConfig, TrainingConfig
 from learner.data import Dataset, Split, load_dataset, split
+from learner.frozen import FrozenAap
 from learner.oracle import OracleCritic
 from learner.prior import PriorStage
 from learner.sampling import ProposalPool
-from learner.training import CHECKPOINT_FILE, TrainingResult, train, without_nan
+from learner.training import CHECKPOINT_FILE, Stage, TrainingResult, train, without_nan
 from shared.errors import UsageError
 from shared.files import read_bounded, write_atomically
 from shared.policy import MAX_POLICY_JSON_BYTES, MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE, Policy
@@ -38,6 +41,8 @@ from shared.store.store import Store
 DONE_FILE = "done.json"
 CONFIG_FILE = "config.json"
 ORACLE_FILE = "oracle.safetensors"
+ORACLE_FOLDER = "oracle"
+AFFORDANCE_FOLDER = "affordance"
 
 StageName = Literal["prior", "aap", "aip"]
 
@@ -90,8 +95,8 @@ def run_stage(job: StageJob, config: LearnerConfig) -> Policy:
         write_atomically(job.out / name, data)
     done = {"stage": job.stage, "fingerprint": fingerprint, **asdict(result), "metrics": without_nan(result.metrics)}
     write_atomically(job.out / DONE_FILE, json.dumps(done, indent=1).encode())
-    for folder in (job.out, job.out / "oracle"):
-        (folder / CHECKPOINT_FILE).unlink(missing_ok=True)
+    for folder in ("", ORACLE_FOLDER, AFFORDANCE_FOLDER):
+        (job.out / folder / CHECKPOINT_FILE).unlink(missing_ok=True)
     return policy
 
 
@@ -131,38 +136,72 @@ def _train(
     job: StageJob, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split, fingerprint: str
 ) -> TrainingResult:
     rng = generator(config.seed, f"learner.{job.stage}.pool")
+    runner = _Runner(job.out, config.seed, fingerprint)
+    policy.modules().eval().requires_grad_(False)
     if job.stage == "prior":
         policy.prior.requires_grad_(True)
-        stage = PriorStage(policy.prior, dataset, parts, config.prior)
-        return train(stage, config.prior, config.seed, job.out, fingerprint)
-    policy.prior.eval().requires_grad_(False)
+        result = runner.train(PriorStage(policy.prior, dataset, parts, config.prior), config.prior, "prior")
+        policy.prior.eval().requires_grad_(False)
+        pool = ProposalPool.of(dataset, policy.prior, rng)
+        prior_answer = PriorAnswer(policy.prior, pool)
+        affordance = AffordanceStage("prior-affordance", prior_answer, dataset, parts, config.prior.affordance, pool)
+        return runner.train_affordance(affordance, config.prior.affordance, result)
     pool = ProposalPool.of(dataset, policy.prior, rng)
     if job.stage == "aap":
         policy.aap.requires_grad_(True)
         oracle = None
         # An AAP that has been trained has a z of its own, which a new oracle would only disturb.
         if config.aap.training == "privileged" and "aap" not in policy.trained:
-            oracle = _train_oracle(job, config, policy, dataset, parts, fingerprint)
-        aap = AapStage(policy.aap, dataset, parts, config.aap, pool, oracle)
-        return train(aap, config.aap, config.seed, job.out, fingerprint)
-    policy.aip.requires_grad_(True)
-    frozen = FrozenAap.of(policy.aap, dataset, pool)
-    aip = AipStage(policy.aip, dataset, parts, config.aip, pool, frozen)
-    return train(aip, config.aip, config.seed, job.out, fingerprint)
+            oracle = _train_oracle(runner, config, policy, dataset, parts)
+        result = runner.train(AapStage(policy.aap, dataset, parts, config.aap, oracle), config.aap, "aap")
+        frozen = FrozenAap.of(policy.aap, dataset, pool)
+        answer: Answer = AapAnswer(frozen, config.aap.top)
+        settings = config.aap.affordance
+    else:
+        policy.aip.requires_grad_(True)
+        frozen = FrozenAap.of(policy.aap, dataset, pool)
+        result = runner.train(AipStage(policy.aip, dataset, parts, config.aip, frozen), config.aip, "aip")
+        policy.aip.eval().requires_grad_(False)
+        features = pool.features_under(policy.aip.encoder, dataset.clouds)
+        answer = AipAnswer(policy.aip, features, frozen, config.aip.top)
+        settings = config.aip.affordance
+    affordance = AffordanceStage(f"{job.stage}-affordance", answer, dataset, parts, settings, pool, frozen)
+    return runner.train_affordance(affordance, settings, result)
+
+
+@dataclass(frozen=True, slots=True)
+class _Runner:
+    """Trains the networks of one stage one after the other, each with checkpoints of its own."""
+
+    out: Path
+    seed: int
+    fingerprint: str
+
+    def train(self, stage: Stage, settings: TrainingConfig, title: str, subfolder: str = "") -> TrainingResult:
+        folder = self.out / subfolder
+        folder.mkdir(exist_ok=True)
+        return train(stage, settings, self.seed, folder, self.fingerprint, title)
+
+    def train_affordance(
+        self, stage: AffordanceStage, settings: AffordanceConfig, before: TrainingResult
+    ) -> TrainingResult:
+        """Train D; returns the critic's result with D's figures added."""
+        result = self.train(stage, settings, stage.name, AFFORDANCE_FOLDER)
+        stage.module.eval().requires_grad_(False)
+        figures = {name: value for name, value in result.metrics.items() if name != "score"}
+        return replace(before, seconds=before.seconds + result.seconds, metrics=before.metrics | figures)
 
 
 def _train_oracle(
-    job: StageJob, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split, fingerprint: str
+    runner: _Runner, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split
 ) -> OracleCritic:
     """Train the oracle critic, save it, and start AAP from it."""
-    folder = job.out / "oracle"
-    folder.mkdir(exist_ok=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(torch_seed(config.seed, "learner.oracle") % 2**32)
         critic = OracleCritic(copy.deepcopy(policy.aap))
     settings = config.aap.model_copy(update={"steps": config.aap.oracle_steps})
-    train(OracleStage(critic, dataset, parts, config.aap), settings, config.seed, folder, fingerprint)
-    write_atomically(job.out / ORACLE_FILE, save({n: t.contiguous() for n, t in critic.state_dict().items()}))
+    runner.train(OracleStage(critic, dataset, parts, config.aap), settings, "oracle", ORACLE_FOLDER)
+    write_atomically(runner.out / ORACLE_FILE, save({n: t.contiguous() for n, t in critic.state_dict().items()}))
     for inherited in ("encoder", "action_encoder", "critic_head"):
         getattr(policy.aap, inherited).load_state_dict(getattr(critic.aap, inherited).state_dict())
     return critic

@@ -1,0 +1,44 @@
+"""What a frozen AAP makes of a data set: computed once, since neither its weights nor the rows change any more."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from learner.data import Dataset
+from learner.sampling import ProposalPool, frozen_features
+from shared.networks.aap import Aap
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenAap:
+    """What a frozen AAP makes of every row and pool point.
+
+    Attributes:
+        aap: frozen.
+        features: f_p|O of the rows, [I, feature_width].
+        pool_features: f_p|O of the pool's points, [O, P, feature_width].
+        codes: z_I of the rows, [I, latent_width].
+        weights: w_I of the rows, [I].
+    """
+
+    aap: Aap
+    features: Tensor
+    pool_features: Tensor
+    codes: Tensor
+    weights: Tensor
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, aap: Aap, dataset: Dataset, pool: ProposalPool) -> "FrozenAap":
+        """Encode everything."""
+        aap.eval().requires_grad_(False)
+        rows = dataset.rows
+        features = frozen_features(aap.encoder, dataset.clouds, rows.cloud, rows.point)
+        pool_features = pool.features_under(aap.encoder, dataset.clouds)
+        codes, weights = aap.interaction_codes(features, rows.xyz, rows.frame, rows.motion, rows.success)
+        return cls(aap, features, pool_features, codes, weights)
+
+    def latents(self, tries: Tensor) -> Tensor:
+        """The z of every prefix of ordered rows `tries`, [..., K]; [..., K + 1, latent_width]."""
+        return self.aap.prefix_latents(self.codes[tries], self.weights[tries])
