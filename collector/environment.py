@@ -3,10 +3,11 @@
 import numpy as np
 
 from collector.articulation import ArticulatedObject
-from collector.camera import EmbreeCamera, observation_from
+from collector.camera import Camera, EmbreeCamera, observation_from
 from collector.catalogue import qualifying_parts
 from collector.clock import StageClock
 from collector.primitives import Trial
+from collector.sapien_camera import SapienCamera
 from collector.scene import Scene
 from shared.configuration import CameraConfig, Fidelity
 from shared.tasks import Task
@@ -21,7 +22,7 @@ CLOSED_SHARE = 0.5
 
 
 class SapienEnvironment:
-    """Implements `shared.vocabulary.Environment` with SAPIEN's physics and an Embree camera.
+    """Implements `shared.vocabulary.Environment` with SAPIEN's physics and a depth camera.
 
     Args:
         target: the object.
@@ -53,7 +54,7 @@ class SapienEnvironment:
         self.qualifying = qualifying_parts(target, task)
         with clock.stage("load"):
             self.scene = Scene(target, dynamics, fidelity)
-        self._camera = EmbreeCamera(target, world_from_camera, camera)
+        self._camera = camera_for(target, world_from_camera, camera)
         self._camera_config = camera
         self._fidelity = fidelity
         self._rng = rng
@@ -130,6 +131,17 @@ class SapienEnvironment:
         self._disturbed = False
         with self._clock.stage("settle"):
             return self.scene.settle(round(SETTLE_STEPS * rate), round(SETTLE_MOST * rate))
+
+
+def camera_for(target: ArticulatedObject, world_from_camera: Float, config: CameraConfig) -> Camera:
+    """The camera that the configuration names.
+
+    Raises:
+        UsageError: it cannot be had on this machine.
+    """
+    if config.renderer == "sapien":
+        return SapienCamera(target, world_from_camera, config)
+    return EmbreeCamera(target, world_from_camera, config)
 
 
 def draw_state(limits: Float, closed: bool, rng: np.random.Generator) -> Float:
