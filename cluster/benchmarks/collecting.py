@@ -5,6 +5,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -18,7 +19,7 @@ from collector.partnet import URDF_FILE
 from collector.published import PublishedRequest, PublishedTiming
 from collector.worker import Worker
 from shared.errors import UsageError, WorkerError
-from shared.plan import Plan, missing_jobs
+from shared.plan import Job, Plan, missing_jobs
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store, info
 
@@ -105,9 +106,8 @@ class CollectionBenchmark:
             "success_rate": self.collected[0].successes / interactions,
             "bytes_per_interaction": self.collected[0].bytes_per_interaction,
             "digest": self.collected[0].digest,
-            "stage_seconds": {
-                stage: median(run.stages[stage] for run in self.collected) for stage in self.collected[0].stages
-            },
+            "stage_seconds": self._by_stage(lambda run: 1.0),
+            "stage_core_seconds": self._by_stage(lambda run: run.cpu_s / run.wall_s),
             "published_trials": len(self.published),
             "published_core_seconds_per_trial": published_s,
             "published_stage_seconds": {
@@ -117,7 +117,14 @@ class CollectionBenchmark:
             "published_label_agreement": mean(run.same_label for run in self.published),
         }
 
-    def _jobs(self) -> list[Any]:
+    def _by_stage(self, scale: Callable[[CollectionRun], float]) -> dict[str, float]:
+        """Medians of the wall seconds by stage, each repeat scaled."""
+        return {
+            stage: median(run.stages[stage] * scale(run) for run in self.collected)
+            for stage in self.collected[0].stages
+        }
+
+    def _jobs(self) -> list[Job]:
         return missing_jobs(self.plan.key, self.rollouts, [], ROLLOUTS_PER_SHARD)
 
     def _collect(self, store: Store, advance: Advance) -> CollectionRun:
