@@ -25,7 +25,7 @@ from shared.store.tables import column_values
 from shared.vocabulary import Float32, OutcomeKind
 
 COLUMNS = (
-    *("plan_key", "rollout", "object_id", "part_mass", "joint_friction", "surface_friction", "direction", "step"),
+    *("plan_key", "rollout", "object_id", "part_mass", "joint_friction", "surface_friction", "step"),
     *("point_index", "point", "rotation", "role", "policy_version", "method", "budget", "target_part"),
     *("joint_positions", "joint_limits", "outcome", "motion", "success", "start_joint_position"),
     *("end_joint_position", "displacement"),
@@ -203,7 +203,6 @@ def _rows(cells: dict[str, Any], cloud: NDArray[np.int64], points: list[Float32]
         motion=cells["end_joint_position"] - cells["start_joint_position"],
         room=_room(cells),
         dynamics=np.stack([cells[name] for name in ("part_mass", "joint_friction", "surface_friction")], axis=1),
-        direction=cells["direction"],
         view=view,
     )
     return Rows(

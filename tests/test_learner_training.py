@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
 from learner.frozen import FrozenAap
 from learner.oracle import OracleCritic
 from learner.prior import PriorStage
-from learner.sampling import ProposalPool, order_rows
+from learner.sampling import Batch, ProposalPool, order_rows
 from learner.stages import DONE_FILE, StageJob, read_policy_folder, run_stage
 from learner.training import METRICS_FILE, Stage, StepResult, train
 from shared.errors import UsageError
@@ -116,18 +117,21 @@ def test_the_oracle_knows_and_aap_learns_from_it(coin_dataset: Dataset) -> None:
     assert after["distillation"] < 0.5 * before["distillation"]
 
 
-def test_each_loss_of_aip_can_be_driven_down(coin_dataset: Dataset) -> None:
+@pytest.mark.parametrize("training", ["paper", "inherited"])
+def test_each_loss_of_aip_can_be_driven_down(coin_dataset: Dataset, training: Literal["paper", "inherited"]) -> None:
     policy, pool = fresh(coin_dataset)
     config = AapConfig(context=4, batch_rollouts=8)
     descend(AapStage(policy.aap, coin_dataset, EVERYTHING, config), 40)
     frozen = FrozenAap.of(policy.aap, coin_dataset, pool)
-    stage = AipStage(policy.aip, coin_dataset, EVERYTHING, AipConfig(draws=2), frozen)
+    stage = AipStage(
+        policy.aip, coin_dataset, EVERYTHING, AipConfig(training=training, batch_rollouts=4, draws=2), frozen
+    )
     before, after = descend(stage, 100)
     # What a try will say is a coin itself, so that only the mean gain at each step can be learnt.
     assert after["critic"] < 0.75 * before["critic"]
     figures = stage.validate()
     assert figures["mean_gain"] > 0.01
-    assert figures["critic"] < figures["critic_of_median"]
+    assert figures["critic"] < 1.1 * figures["critic_of_constant"]
 
 
 def answers(policy: Policy, dataset: Dataset, pool: ProposalPool) -> dict[str, tuple[Answer, FrozenAap | None]]:
@@ -166,7 +170,7 @@ def test_gains_are_differences_of_the_loss_on_the_same_rows(coin_dataset: Datase
     ordered = order_rows(coin_dataset, [0, 1], 12, np.random.default_rng(0))
     found = stage.gains(ordered)
     with torch.no_grad():
-        logits = predict(policy.aap, coin_dataset, ordered, 3).logits
+        logits = predict(policy.aap, Batch.of(coin_dataset, ordered), 3).logits
     success = coin_dataset.rows.success[ordered.rows][:, None].expand_as(logits)
     losses = nn.functional.binary_cross_entropy_with_logits(logits, success, reduction="none")[..., 3:].mean(-1)
     torch.testing.assert_close(found.gains, losses[:, :-1] - losses[:, 1:], rtol=1e-3, atol=1e-5)
@@ -197,8 +201,10 @@ def test_gradients_reach_their_own_module_and_no_other(dataset: Dataset) -> None
     before = {name: tensor.clone() for name, tensor in policy.aap.state_dict().items()}
     frozen = FrozenAap.of(policy.aap, dataset, pool)
     aip = AipStage(policy.aip, dataset, EVERYTHING, AipConfig(), frozen)
-    learnt = {child for child, _ in policy.aip.named_children()}
-    assert reached(aip, whole) == learnt - {"affordance_head", "actionability_encoder"}
+    learnt = {child for child, _ in policy.aip.named_children()} - {"affordance_head", "actionability_encoder"}
+    assert reached(aip, whole) == learnt - {"encoder"}
+    paper = AipStage(policy.aip, dataset, EVERYTHING, AipConfig(training="paper"), frozen)
+    assert reached(paper, whole) == learnt
     descend(aip, 3)
     assert all(torch.equal(tensor, before[name]) for name, tensor in policy.aap.state_dict().items())
     assert all(p.grad is None for p in policy.aap.parameters())

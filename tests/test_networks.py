@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from shared.grouping import group_cloud
 from shared.networks.aap import Aap
-from shared.networks.actions import action_inputs, geodesic_distance, orthonormal_frames
+from shared.networks.actions import MOMENT_SCALE, action_inputs, geodesic_distance, orthonormal_frames
 from shared.networks.configuration import NETWORKS, NetworkConfig
 from shared.networks.layers import Head
 from shared.networks.pointnet2 import CloudBatch, PointNet2
@@ -107,7 +107,7 @@ def test_geodesic_distance_is_the_angle() -> None:
 def test_action_features_hold_the_moment() -> None:
     point, frame = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
     inputs = action_inputs(point, frame, TINY)
-    torch.testing.assert_close(inputs[9:], torch.tensor([0.0, 0.0, 1.0]))
+    torch.testing.assert_close(inputs[9:], MOMENT_SCALE * torch.tensor([0.0, 0.0, 1.0]))
     plain = TINY.model_copy(update={"action_features": False})
     assert torch.equal(action_inputs(point, frame, plain), frame)
 

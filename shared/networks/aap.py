@@ -29,10 +29,10 @@ class Aap(nn.Module):
         self.encoder = PointNet2(config)
         self.action_encoder = VectorEncoder(action_width(config), config)
         self.outcome_encoder = VectorEncoder(outcome_width(config), config)
-        self.code_head = Head((width, width, width), latent, config)
+        self.code_head = Head((width, width, width), latent, config, product=config.products)
         self.attention_head = Head((width, width, width), 1, config)
         self.empty_latent = nn.Parameter(torch.zeros(latent))
-        self.critic_head = Head((width, width, latent), 1, config)
+        self.critic_head = Head((width, width, latent), 1, config, product=config.products)
         self.affordance_head = Head((width, latent), 1, config)
 
     def interaction_codes(

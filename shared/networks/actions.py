@@ -12,6 +12,10 @@ from shared.networks.configuration import NetworkConfig
 FRAME_WIDTH = 6
 MOTION_SCALE = 0.01
 """The motion that counts as a success, tau of the paper; log(1 + m / tau) spreads small motions out."""
+PLACE_SCALE = 3.0
+"""Places on an object, a few tenths of a unit, come to about 1."""
+MOMENT_SCALE = 10.0
+"""Lever arms that decide whether a part turns, some hundredths of a unit, come to some tenths."""
 _DEGENERATE = 1e-4
 """Length below which a direction is mostly rounding."""
 
@@ -35,7 +39,8 @@ def action_inputs(points: Tensor, frames: Tensor, config: NetworkConfig) -> Tens
     if not config.action_features:
         return frames
     places = points.expand(*frames.shape[:-1], 3)
-    return torch.cat([frames, places, torch.linalg.cross(places, frames[..., :3])], dim=-1)
+    moments = torch.linalg.cross(places, frames[..., :3])
+    return torch.cat([frames, PLACE_SCALE * places, MOMENT_SCALE * moments], dim=-1)
 
 
 def outcome_width(config: NetworkConfig) -> int:
