@@ -42,7 +42,7 @@ class AapStage:
     """Trains all of `Aap` but D (AdaAfford, AAP Action Scoring Loss).
 
     A random subset of a rollout's interactions is the context; all rows that are not in it are predicted, after each of
-    its prefixes and after none. With an oracle, z is drawn to the oracle's as well.
+    its prefixes and after none. With an oracle, scores and z are drawn to the oracle's as well.
     """
 
     name = "aap"
@@ -89,6 +89,9 @@ class AapStage:
         losses = {"critic": action_scoring_loss(prediction.logits, batch.success[:, None], asked)}
         if self.oracle is not None:
             told = self._told(batch, ordered.valid)
+            with torch.no_grad():
+                surer = torch.sigmoid(self.oracle.logits(batch))[:, None]
+            losses["imitation"] = config.imitation * action_scoring_loss(prediction.logits, surer, asked)
             losses["distillation"] = config.distillation * distillation_loss(prediction.latents, told, asked.any(-1))
         return StepResult(losses, int(ordered.valid.sum()))
 

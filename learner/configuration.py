@@ -84,8 +84,11 @@ class AapConfig(TrainingConfig):
     top: int = Field(5, ge=1)
     """Best proposals whose mean score is a point's actionability, as published."""
     affordance: AffordanceConfig = AffordanceConfig()
-    distillation: float = Field(1.0, ge=0)
+    distillation: float = Field(0.3, ge=0)
     """Weight of the loss that draws z to the oracle's; privileged training only."""
+    imitation: float = Field(1.0, ge=0)
+    """Weight of the loss that draws scores to the oracle's, which are surer than single successes; privileged training
+    only."""
     inherited_rate: float = Field(0.2, ge=0, le=1)
     """Factor of the learning rate for what comes from the oracle; privileged training only."""
     oracle_steps: int = Field(250, ge=1)

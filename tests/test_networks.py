@@ -129,15 +129,16 @@ def test_latent_forgets_the_order(count: int, seed: int) -> None:
     torch.testing.assert_close(module.latent(z[order], w[order]), module.latent(z, w), rtol=1e-4, atol=1e-5)
 
 
-def test_latents_of_prefixes_are_the_latents_of_the_prefixes() -> None:
-    module = Aap(TINY)
+@pytest.mark.parametrize("evidence", [False, True])
+def test_latents_of_prefixes_are_the_latents_of_the_prefixes(evidence: bool) -> None:
+    module = Aap(TINY.model_copy(update={"evidence": evidence}))
     z, w = codes(module, 9)
     prefixes = module.prefix_latents(z, w)
     assert torch.equal(prefixes[0], module.empty_latent)
     for k in range(1, 10):
-        mean = (z[:k] * w[:k, None]).sum(0) / w[:k].sum()
-        torch.testing.assert_close(prefixes[k], mean, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(prefixes[k], module.latent(z[:k], w[:k]), rtol=1e-4, atol=1e-5)
+        mean = (z[:k] * w[:k, None]).sum(0) / w[:k].sum()
+        assert torch.allclose(prefixes[k], mean, rtol=1e-4, atol=1e-5) != evidence
 
 
 def test_attention_weights_are_positive_whatever_the_weights_say() -> None:

@@ -39,8 +39,10 @@ class NetworkConfig(StrictModel):
     outcome_features: bool = True
     """Whether an outcome enters with log(1 + m / tau) and r, beside the motion m. As published: not."""
     products: bool = True
-    """Whether critics multiply actions with z, and AAP with outcomes (see `shared.networks.layers.Head`). As published:
-    not."""
+    """Whether actions are multiplied with z and with outcomes, and AAP's D multiplies points with z (see
+    `shared.networks.layers.Head`). As published: not."""
+    evidence: bool = True
+    """Whether z is told how much was tried, beside the mean of what the tries say. As published: not."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "NetworkConfig":
@@ -66,6 +68,7 @@ NETWORKS = {
         action_features=False,
         outcome_features=False,
         products=False,
+        evidence=False,
     ),
 }
 """Named configurations: "small" for clouds of about 2,048 points on a few cores, and "published"."""
