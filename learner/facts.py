@@ -44,6 +44,7 @@ class HiddenColumns:
         room: [I, 2], how far the target joint can go up and down from where it starts.
         dynamics: [I, 3], part mass, joint friction, surface friction.
         view: [I, 3, 3], view frame from world frame.
+        middle: [I, 3], view frame, of what may be moved; actions are told their places from there.
     """
 
     part: list[tuple[str, int]]
@@ -53,6 +54,7 @@ class HiddenColumns:
     room: Float
     dynamics: Float
     view: Float
+    middle: Float
 
 
 def facts_of(hidden: HiddenColumns) -> Float:
@@ -65,7 +67,10 @@ def facts_of(hidden: HiddenColumns) -> Float:
     twists = fit_twists(hidden)
     known = [part in twists for part in hidden.part]
     twist = np.stack([twists.get(part, np.zeros(6)) for part in hidden.part]).reshape(-1, 2, 3)
-    turned = np.einsum("iab,icb->ica", hidden.view, twist).reshape(-1, 6)
+    turned = np.einsum("iab,icb->ica", hidden.view, twist)
+    # w x p + v is the same motion, whatever point p and v are taken from.
+    turned[:, 1] += np.cross(turned[:, 0], hidden.middle)
+    turned = turned.reshape(-1, 6)
     mass, friction, surface = hidden.dynamics.T
     numbers = np.stack([np.log(np.maximum(mass, 1e-6)), friction, np.log(np.maximum(surface, 1e-6))], axis=1)
     room = np.clip(np.nan_to_num(hidden.room, nan=0.0, posinf=MAX_ROOM), 0.0, MAX_ROOM)[..., None]

@@ -94,7 +94,7 @@ class Batch:
         clouds: the clouds that occur, each once.
         cloud: [B, n], index of each row's cloud among them.
         point: [B, n], index of p in it.
-        xyz: p, [B, n, 3].
+        xyz: p less the middle of what may be moved, [B, n, 3].
         frame: approach and forward, [B, n, 6].
         motion: m, [B, n].
         success: r as 0 or 1, [B, n].

@@ -25,7 +25,7 @@ from learner.metrics import area_under_roc, best_f_score, discrimination, f_scor
 from learner.sampling import Batch, order_rows
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
-from shared.networks.actions import orthonormal_frames
+from shared.networks.actions import middle_of, orthonormal_frames
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
 from shared.store.store import Store
@@ -72,8 +72,9 @@ def test_every_cloud_is_there_once_and_every_row_in_the_view_frame(
         for interaction, row in zip(rollout.interactions, index.tolist(), strict=True):
             view = view_from_world(rollout.observations[interaction.observation].world_from_camera)
             cloud = dataset.clouds.points[dataset.rows.cloud[row]]
-            assert torch.equal(cloud[dataset.rows.point[row]], dataset.rows.xyz[row])
-            np.testing.assert_allclose(dataset.rows.xyz[row], view @ interaction.action.point, atol=1e-6)
+            middle = cloud[dataset.movable[dataset.rows.cloud[row]]].mean(dim=0)
+            torch.testing.assert_close(cloud[dataset.rows.point[row]] - middle, dataset.rows.xyz[row])
+            np.testing.assert_allclose(dataset.rows.xyz[row] + middle, view @ interaction.action.point, atol=1e-6)
             expected = np.concatenate([view @ interaction.action.approach, view @ interaction.action.forward])
             np.testing.assert_allclose(dataset.rows.frame[row], expected, atol=1e-6)
             assert bool(dataset.rows.success[row]) == interaction.outcome.success
@@ -152,6 +153,7 @@ def hidden_of(points: np.ndarray, displacements: np.ndarray, motions: np.ndarray
         room=np.tile([np.inf, 0.0], (count, 1)),
         dynamics=np.ones((count, 3)),
         view=np.tile(np.eye(3), (count, 1, 1)),
+        middle=np.zeros((count, 3)),
     )
 
 
@@ -187,6 +189,20 @@ def test_facts_do_not_depend_on_which_way_a_file_counts_a_joint() -> None:
     np.testing.assert_allclose(facts_of(one), facts_of(other), atol=1e-6)
 
 
+def test_facts_tell_the_same_motion_from_any_middle() -> None:
+    rng = np.random.default_rng(1)
+    points, motions = rng.uniform(-0.5, 0.5, (30, 3)), rng.uniform(0.05, 0.2, 30)
+    displacements = turned(points, np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.3, 0.0]), motions)
+    hidden = hidden_of(points, displacements, motions)
+    middle = np.array([0.2, -0.4, 0.3])
+    for one, place in (
+        (hidden, points),
+        (dataclasses.replace(hidden, middle=np.tile(middle, (30, 1))), points - middle),
+    ):
+        w, v = facts_of(one)[:, 1 + DYNAMICS_WIDTH : DYNAMICS_WIDTH + WAY_WIDTH].reshape(30, 2, 3).swapaxes(0, 1)
+        np.testing.assert_allclose((np.cross(w, place) + v) * motions[:, None], displacements, atol=0.02)
+
+
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_facts_turn_as_the_object_does(mirrored: bool) -> None:
     rng = np.random.default_rng(2)
@@ -215,7 +231,8 @@ def test_a_batch_is_turned_as_one(dataset: Dataset) -> None:
     batch = Batch.of(dataset, ordered, turns)
     plain = Batch.of(dataset, ordered)
     # A row's point is still the point of its cloud that it names.
-    torch.testing.assert_close(batch.clouds.points[batch.cloud, batch.point], batch.xyz)
+    middles = middle_of(batch.clouds.points, dataset.movable[ordered.clouds])
+    torch.testing.assert_close(batch.clouds.points[batch.cloud, batch.point] - middles[batch.cloud], batch.xyz)
     for one, other in ((batch.frame[..., :3], plain.frame[..., :3]), (batch.xyz, plain.xyz)):
         torch.testing.assert_close(one.norm(dim=-1), other.norm(dim=-1))
     along, before = ((b.xyz * b.frame[..., :3]).sum(-1) for b in (batch, plain))

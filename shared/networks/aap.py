@@ -45,7 +45,7 @@ class Aap(nn.Module):
 
         Args:
             features: f_p|O at each interaction's point, [..., feature_width].
-            points: p, [..., 3].
+            points: p less the middle of what may be moved, [..., 3].
             frames: approach and forward, [..., 6].
             motions: m, [...].
             successes: r as 0 or 1, [...].
@@ -90,7 +90,7 @@ class Aap(nn.Module):
 
         Args:
             features: f_p|O, [..., feature_width].
-            points: p, [..., 3].
+            points: p less the middle of what may be moved, [..., 3].
             frames: approach and forward, [..., 6].
             latents: z, [..., latent_width].
 

@@ -36,7 +36,7 @@ class Aip(nn.Module):
 
         Args:
             features: f_p|O of this module, [..., feature_width].
-            points: p, [..., 3].
+            points: p less the middle of what may be moved, [..., 3].
             frames: approach and forward, [..., 6].
             latents: z, [..., latent_width].
             aap_scores: s^AAP_u|z, probabilities, [...].
