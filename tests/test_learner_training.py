@@ -17,6 +17,7 @@ from learner.affordance import AapAnswer, AffordanceStage, AipAnswer, Answer, Pr
 from learner.aip import AipStage
 from learner.checkpoint import Cursor
 from learner.configuration import AapConfig, AffordanceConfig, AipConfig, LearnerConfig, PriorConfig, TrainingConfig
+from learner.curve import adaptation_curve, proposal_gains
 from learner.data import Dataset, Split, load_dataset
 from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
 from learner.frozen import FrozenAap
@@ -161,6 +162,30 @@ def test_an_affordance_network_follows_its_critic_and_nothing_else_moves(coin_da
     figures = stage.validate()
     assert figures["affordance"] < figures["affordance_of_median"]
     assert figures["affordance_rank_correlation"] > 0.5
+
+
+def test_the_curve_falls_where_tries_tell_and_greedy_beats_chance(coin_dataset: Dataset) -> None:
+    policy, pool = fresh(coin_dataset)
+    descend(AapStage(policy.aap, coin_dataset, EVERYTHING, AapConfig(context=4, batch_rollouts=8)), 40)
+    frozen = FrozenAap.of(policy.aap, coin_dataset, pool)
+    oracle = OracleCritic(policy.aap)
+    rollouts = EVERYTHING.validation
+    curve = adaptation_curve(coin_dataset, rollouts, frozen, policy.prior, oracle, (0, 1, 4), draws=2)
+    assert [(point.method, point.tries) for point in curve] == [
+        ("prior", 0),
+        ("aap", 0),
+        ("aap", 1),
+        ("aap", 4),
+        ("oracle", 0),
+    ]
+    # The last rows of two draws of each rollout, the same whatever was tried.
+    assert {point.figures.rows for point in curve} == {len(rollouts) * 2 * (12 - 4)}
+    assert curve[2].figures.bce < curve[1].figures.bce
+    assert curve[2].closed(curve[1], curve[3]) > 0
+    first, second = proposal_gains(coin_dataset, rollouts, frozen, policy.aip, (0, 1), draws=2)
+    assert all(gain.greedy >= max(gain.random, gain.aip) for gain in (first, second))
+    assert first.random > 0
+    assert second.loss < first.loss
 
 
 def test_gains_are_differences_of_the_loss_on_the_same_rows(coin_dataset: Dataset) -> None:
