@@ -64,7 +64,8 @@ class AapStage:
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """All of AAP but D; what comes from an oracle moves more slowly."""
-        trained = [p for name, p in self.aap.named_parameters() if not name.startswith("affordance_head.")]
+        of_d = {id(p) for p in self.aap.affordance_network().parameters()}
+        trained = [p for p in self.aap.parameters() if id(p) not in of_d]
         if self.oracle is None:
             return [ParameterGroup(tuple(trained))]
         inherited = {

@@ -145,14 +145,14 @@ class AapAnswer:
     """AAP: the mean of the best scores that the critic gives under z."""
 
     def __init__(self, frozen: FrozenAap, top: int) -> None:
-        self.module: nn.Module = frozen.aap.affordance_head
+        self.module: nn.Module = frozen.aap.affordance_network()
         self.frozen = frozen
         self.top = top
 
     def __call__(self, questions: Questions) -> tuple[Tensor, Tensor]:
         """Predicted and target, [Q] each."""
         features, scores = aap_scores(self.frozen, questions)
-        return self.frozen.aap.actionability(features, questions.latents), top_score(scores, self.top)
+        return self.frozen.aap.actionability(features, questions.point, questions.latents), top_score(scores, self.top)
 
 
 class AipAnswer:
@@ -170,7 +170,7 @@ class AipAnswer:
         aap_features, scores = aap_scores(self.frozen, questions)
         features, latents = self.features[questions.cloud, questions.slot], questions.latents
         with torch.no_grad():
-            believed = self.frozen.aap.actionability(aap_features, latents)
+            believed = self.frozen.aap.actionability(aap_features, questions.point, latents)
             gains = self.aip.action_scores(
                 features[:, None], questions.point[:, None], questions.frames, latents[:, None], scores
             )

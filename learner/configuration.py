@@ -39,7 +39,7 @@ class AugmentationConfig(StrictModel):
 class AffordanceConfig(TrainingConfig):
     """An affordance network D, trained when its critic is done."""
 
-    steps: int = Field(400, ge=1)
+    steps: int = Field(300, ge=1)
     learning_rate: float = Field(3e-3, gt=0)
     batch_rollouts: int = Field(16, ge=1)
     points: int = Field(64, ge=1)
@@ -53,9 +53,10 @@ class AffordanceConfig(TrainingConfig):
 class PriorConfig(TrainingConfig):
     """The Where2Act prior."""
 
+    steps: int = Field(200, ge=1)
     batch_clouds: int = Field(12, ge=1)
-    actions_per_cloud: int = Field(16, ge=1)
-    """At the most; a cloud of a restart rollout has 8."""
+    actions_per_cloud: int = Field(32, ge=1)
+    """At the most; a cloud of a restart rollout has 8, or all of them where every state is the same."""
     proposals: int = Field(100, ge=1)
     """Draws a point for the proposal loss, as published."""
     augmentation: AugmentationConfig = AugmentationConfig()
@@ -68,7 +69,7 @@ class AapConfig(TrainingConfig):
     training: Literal["paper", "privileged"] = "paper"
     """"paper": end to end. "privileged": first an oracle critic that is told the hidden facts; AAP starts from it and
     learns to infer them. An AAP that is already trained is fine-tuned end to end either way."""
-    steps: int = Field(250, ge=1)
+    steps: int = Field(120, ge=1)
     learning_rate: float = Field(3e-3, gt=0)
     batch_rollouts: int = Field(12, ge=1)
     """Rows of one rollout share what is hidden, so that few rollouts a step teach little of it."""
@@ -91,7 +92,7 @@ class AapConfig(TrainingConfig):
     only."""
     inherited_rate: float = Field(0.2, ge=0, le=1)
     """Factor of the learning rate for what comes from the oracle; privileged training only."""
-    oracle_steps: int = Field(250, ge=1)
+    oracle_steps: int = Field(120, ge=1)
     """Steps of the oracle critic; privileged training only."""
 
 
@@ -101,7 +102,7 @@ class AipConfig(TrainingConfig):
     training: Literal["paper", "inherited"] = "inherited"
     """"paper": a point encoder of its own, and L1, which finds the median gain of a try. "inherited": AAP's encoder as
     it is, so that a step may see ten times the rollouts, and squares, which find the mean gain."""
-    steps: int = Field(300, ge=1)
+    steps: int = Field(200, ge=1)
     validate_every: int = Field(25, ge=1)
     patience: int = Field(8, ge=1)
     batch_rollouts: int = Field(24, ge=1)

@@ -19,7 +19,7 @@ class OracleCritic(nn.Module):
         super().__init__()
         self.aap = aap
         self.oracle = OracleEncoder(FACTS_WIDTH, aap.config)
-        for unused in (aap.outcome_encoder, aap.code_head, aap.attention_head, aap.affordance_head):
+        for unused in (aap.outcome_encoder, aap.code_head, aap.attention_head, aap.affordance_network()):
             unused.requires_grad_(False)
         aap.empty_latent.requires_grad_(False)
 

@@ -95,8 +95,9 @@ class Adapter:
     @torch.inference_mode()
     def affordance(self, observation: Observation, history: Sequence[Interaction]) -> Float32:
         """A_I: the AAP actionability of every point after a history, [N], in [0, 1]."""
-        features = self._features(observation, "aap", np.arange(len(observation.points)))
-        return self.policy.aap.actionability(features, self.z(history)).numpy()
+        everywhere = np.arange(len(observation.points))
+        features, places = self._features(observation, "aap", everywhere), self._points(observation, everywhere)
+        return self.policy.aap.actionability(features, places, self.z(history)).numpy()
 
     @torch.inference_mode()
     def prior_affordance(self, observation: Observation) -> Float32:
@@ -155,7 +156,8 @@ class Adapter:
     @torch.inference_mode()
     def information(self, observation: Observation, points: NDArray[np.int64], latent: Tensor) -> Float32:
         """The AIP actionability a^AIP_p|z of the points at the indices `points`, [len(points)]."""
-        expected = self.policy.aap.actionability(self._features(observation, "aap", points), latent)
+        places = self._points(observation, points)
+        expected = self.policy.aap.actionability(self._features(observation, "aap", points), places, latent)
         features = self._features(observation, "aip", points)
         return self.policy.aip.actionability(features, latent, expected).numpy()
 

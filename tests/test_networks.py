@@ -153,10 +153,11 @@ def test_affordance_does_not_bend_the_critics_features() -> None:
     module = Aap(TINY)
     batch = clouds(1)
     features = module.encoder.at(module.encoder(batch), torch.zeros(4, dtype=torch.long), torch.arange(4))
-    module.actionability(features, torch.zeros(12, requires_grad=True)).sum().backward()
+    points, latents = batch.points[0, :4], torch.zeros(12, requires_grad=True)
+    module.actionability(features, points, latents).sum().backward()
     moved = {name for name, p in module.named_parameters() if p.grad is not None}
     assert moved
-    assert all(name.startswith("affordance_head") for name in moved)
+    assert all(name.startswith(("affordance_head", "place_encoder")) for name in moved)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shared.networks.actions import action_inputs, action_width, outcome_inputs, outcome_width
+from shared.networks.actions import PLACE_SCALE, action_inputs, action_width, outcome_inputs, outcome_width
 from shared.networks.configuration import NetworkConfig
 from shared.networks.layers import Head, VectorEncoder
 from shared.networks.pointnet2 import PointNet2
@@ -34,7 +34,9 @@ class Aap(nn.Module):
         self.evidence_head = Head((latent, latent), latent, config) if config.evidence else None
         self.empty_latent = nn.Parameter(torch.zeros(latent))
         self.critic_head = Head((width, width, latent), 1, config, product=config.products)
-        self.affordance_head = Head((width, latent), 1, config, product=config.products)
+        self.place_encoder = VectorEncoder(3, config) if config.action_features else None
+        place = (width,) if config.action_features else ()
+        self.affordance_head = Head((width, *place, latent), 1, config, product=config.products)
 
     def interaction_codes(
         self, features: Tensor, points: Tensor, frames: Tensor, motions: Tensor, successes: Tensor
@@ -100,10 +102,21 @@ class Aap(nn.Module):
         logits: Tensor = self.critic_head(features, actions, latents)
         return logits.squeeze(-1)
 
-    def actionability(self, features: Tensor, latents: Tensor) -> Tensor:
-        """AAP actionability a_p|z in [0, 1] (AdaAfford, Adaptive Affordance Network), [...]; leading axes broadcast."""
-        logits: Tensor = self.affordance_head(features.detach(), latents.detach())
+    def actionability(self, features: Tensor, points: Tensor, latents: Tensor) -> Tensor:
+        """AAP actionability a_p|z in [0, 1] (AdaAfford, Adaptive Affordance Network), [...]; leading axes broadcast.
+
+        Deviation: where actions enter with p, D is told p too, since what its critic scores turns on lever arms.
+        """
+        inputs = [features.detach(), latents.detach()]
+        if self.place_encoder is not None:
+            inputs.insert(1, self.place_encoder(PLACE_SCALE * points))
+        logits: Tensor = self.affordance_head(*inputs)
         return torch.sigmoid(logits.squeeze(-1))
+
+    def affordance_network(self) -> nn.Module:
+        """All that D has of its own."""
+        own = {"head": self.affordance_head}
+        return nn.ModuleDict(own if self.place_encoder is None else own | {"place": self.place_encoder})
 
 
 class OracleEncoder(nn.Module):
