@@ -66,9 +66,10 @@ class PriorConfig(TrainingConfig):
 class AapConfig(TrainingConfig):
     """Adaptive Affordance Prediction."""
 
-    training: Literal["paper", "privileged"] = "paper"
+    training: Literal["paper", "privileged"] = "privileged"
     """"paper": end to end. "privileged": first an oracle critic that is told the hidden facts; AAP starts from it and
-    learns to infer them. An AAP that is already trained is fine-tuned end to end either way."""
+    learns to infer them, and to imitate its scores. An AAP that is already trained is fine-tuned end to end either way.
+    """
     steps: int = Field(120, ge=1)
     learning_rate: float = Field(3e-3, gt=0)
     batch_rollouts: int = Field(12, ge=1)
