@@ -19,7 +19,7 @@ from rich.console import Console
 
 from cluster.collection import Collected, collect
 from cluster.configuration import CampaignConfig
-from cluster.fleet import Fleet
+from cluster.fleet import Fleet, make_worker
 from cluster.ledger import Ledger
 from cluster.locking import only_driver
 from cluster.objects import objects_for
@@ -28,7 +28,6 @@ from cluster.session import FleetMaker, fleets
 from cluster.stages import Stage, run_stages
 from cluster.training import Trainer
 from collector.catalogue import split
-from collector.worker import Worker
 from shared.errors import UsageError
 from shared.files import write_atomically
 from shared.plan import Plan, Setting
@@ -48,7 +47,7 @@ class Crew:
         """The fleet whose workers write to `store`."""
         if self._fleet is None or self._of != (store, objects):
             self.dismiss()
-            self._fleet, self._of = self._make_fleet(partial(Worker, store, objects)), (store, objects)
+            self._fleet, self._of = self._make_fleet(partial(make_worker, store, objects)), (store, objects)
         return self._fleet
 
     def dismiss(self) -> None:

@@ -10,6 +10,7 @@ again after any failure, and at-least-once delivery is enough.
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from shared.errors import AdaAffordError, WorkerError
@@ -38,6 +39,16 @@ class Worker(Protocol):
 
 WorkerFactory = Callable[[], Worker]
 """Makes a worker in the process that will use it; must be picklable for a fleet of processes."""
+
+
+def make_worker(store: Path, objects: Path) -> Worker:
+    """Make a `collector.worker.Worker` in the process that calls; `partial` of this is a `WorkerFactory`.
+
+    The engine is imported here and not by the driver, which needs none where Ray's actors do the work.
+    """
+    from collector.worker import Worker as Collector
+
+    return Collector(store, objects)
 
 
 class JobError(WorkerError):

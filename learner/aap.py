@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from learner.augmentation import draw_turns
 from learner.configuration import AapConfig
 from learner.data import Dataset, Split
 from learner.losses import action_scoring_loss, distillation_loss
 from learner.metrics import discrimination
 from learner.oracle import OracleCritic
-from learner.sampling import OrderedRows, draw_numbers, order_rows, spread
+from learner.sampling import Batch, draw_numbers, order_rows, spread
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aap import Aap
 
@@ -41,7 +42,7 @@ class AapStage:
     """Trains all of `Aap` but D (AdaAfford, AAP Action Scoring Loss).
 
     A random subset of a rollout's interactions is the context; all rows that are not in it are predicted, after each of
-    its prefixes and after none. With an oracle, z is drawn to the oracle's as well.
+    its prefixes and after none. With an oracle, scores and z are drawn to the oracle's as well.
     """
 
     name = "aap"
@@ -82,12 +83,15 @@ class AapStage:
         rollouts = [train[number] for number in chosen]
         ordered = order_rows(self.dataset, rollouts, config.rows_per_rollout, rng, config.proposed_first)
         context = ordered.longest_context(config.context)
-        prediction = predict(self.aap, self.dataset, ordered, context)
+        batch = Batch.of(self.dataset, ordered, draw_turns(len(rollouts), config.augmentation, rng))
+        prediction = predict(self.aap, batch, context)
         asked = ordered.asked(context)
-        success = self.dataset.rows.success[ordered.rows][:, None]
-        losses = {"critic": action_scoring_loss(prediction.logits, success, asked)}
+        losses = {"critic": action_scoring_loss(prediction.logits, batch.success[:, None], asked)}
         if self.oracle is not None:
-            told = self._told(ordered)
+            told = self._told(batch, ordered.valid)
+            with torch.no_grad():
+                surer = torch.sigmoid(self.oracle.logits(batch))[:, None]
+            losses["imitation"] = config.imitation * action_scoring_loss(prediction.logits, surer, asked)
             losses["distillation"] = config.distillation * distillation_loss(prediction.latents, told, asked.any(-1))
         return StepResult(losses, int(ordered.valid.sum()))
 
@@ -101,8 +105,9 @@ class AapStage:
         for start in range(0, len(rollouts), _CHUNK):
             ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
             context = ordered.longest_context(self.config.context)
-            prediction = predict(self.aap, self.dataset, ordered, context)
-            success, asked = self.dataset.rows.success[ordered.rows], ordered.asked(context)
+            batch = Batch.of(self.dataset, ordered)
+            prediction = predict(self.aap, batch, context)
+            success, asked = batch.success, ordered.asked(context)
             losses.append(action_scoring_loss(prediction.logits, success[:, None], asked))
             asked_last = asked[:, -1]
             for kept, prefix in zip(scores, (0, -1), strict=True):
@@ -121,11 +126,11 @@ class AapStage:
         }
 
     @torch.no_grad()
-    def _told(self, ordered: OrderedRows) -> Tensor:
+    def _told(self, batch: Batch, valid: Tensor) -> Tensor:
         """The oracle's z of each rollout, the mean over its rows: parts of one object may have other hinges."""
         assert self.oracle is not None
-        latents = self.oracle.oracle(self.dataset.rows.facts[ordered.rows])
-        weights = ordered.valid[..., None].to(latents.dtype)
+        latents = self.oracle.oracle(batch.facts)
+        weights = valid[..., None].to(latents.dtype)
         mean: Tensor = (latents * weights).sum(dim=1) / weights.sum(dim=1)
         return mean
 
@@ -151,9 +156,9 @@ class OracleStage:
         train = self.parts.train
         chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
         ordered = order_rows(self.dataset, [train[k] for k in chosen], self.config.rows_per_rollout, rng)
-        logits = self.critic.logits(self.dataset, ordered)
-        success = self.dataset.rows.success[ordered.rows]
-        return StepResult({"critic": action_scoring_loss(logits, success, ordered.valid)}, int(ordered.valid.sum()))
+        batch = Batch.of(self.dataset, ordered, draw_turns(len(chosen), self.config.augmentation, rng))
+        loss = action_scoring_loss(self.critic.logits(batch), batch.success, ordered.valid)
+        return StepResult({"critic": loss}, int(ordered.valid.sum()))
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -163,22 +168,17 @@ class OracleStage:
         scores, labels = [], []
         for start in range(0, len(rollouts), _CHUNK):
             ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
-            scores.append(torch.sigmoid(self.critic.logits(self.dataset, ordered))[ordered.valid])
-            labels.append(self.dataset.rows.success[ordered.rows][ordered.valid])
+            batch = Batch.of(self.dataset, ordered)
+            scores.append(torch.sigmoid(self.critic.logits(batch))[ordered.valid])
+            labels.append(batch.success[ordered.valid])
         found = discrimination(torch.cat(scores).numpy(), torch.cat(labels).numpy())
         return {"score": found.bce, "f_score": found.f_score, "auc": found.auc, "base_rate": found.base_rate}
 
 
-def predict(aap: Aap, dataset: Dataset, ordered: OrderedRows, context: int) -> Prediction:
-    """Score all rows after every prefix of the first `context` of them; each cloud is encoded once."""
-    rows, index = dataset.rows, ordered.rows
-    encoded = aap.encoder(dataset.clouds.select(ordered.clouds))
-    flat = aap.encoder.at(encoded, ordered.cloud.flatten(), rows.point[index].flatten())
-    features = flat.reshape(*index.shape, -1)
-    tries = index[:, :context]
-    codes, weights = aap.interaction_codes(
-        features[:, :context], rows.xyz[tries], rows.frame[tries], rows.motion[tries], rows.success[tries]
-    )
-    latents = aap.prefix_latents(codes, weights)
-    xyz, frames = rows.xyz[index][:, None], rows.frame[index][:, None]
+def predict(aap: Aap, batch: Batch, context: int) -> Prediction:
+    """Score all rows after every prefix of the first `context` of them."""
+    features = batch.features(aap.encoder)
+    tries = (features, batch.xyz, batch.frame, batch.motion, batch.success)
+    latents = aap.prefix_latents(*aap.interaction_codes(*(x[:, :context] for x in tries)))
+    xyz, frames = batch.xyz[:, None], batch.frame[:, None]
     return Prediction(aap.action_logits(features[:, None], xyz, frames, latents[:, :, None]), latents)

@@ -37,7 +37,7 @@ class Questions:
     Attributes:
         cloud: [Q], index of the cloud.
         slot: [Q], which of the pool's points.
-        point: p, [Q, 3].
+        point: p less the middle of what may be moved, [Q, 3].
         frames: proposals there, [Q, S, 6].
         latents: z, [Q, latent_width]; of no tries where there is no AAP yet.
     """
@@ -112,8 +112,8 @@ class AffordanceStage:
         config, count = self.config, self.config.points
         ordered = order_rows(self.dataset, rollouts, config.context + 1, rng)
         which = torch.from_numpy(rng.integers(0, len(rollouts), count))
-        place = torch.from_numpy(_below(ordered.valid.sum(dim=1).numpy()[which.numpy()], rng))
-        cloud = ordered.clouds[ordered.cloud[which, place]]
+        row = torch.from_numpy(_below(ordered.valid.sum(dim=1).numpy()[which.numpy()], rng))
+        cloud = ordered.clouds[ordered.cloud[which, row]]
         slot = torch.from_numpy(rng.integers(0, self.pool.point.shape[1], count))
         latents = torch.zeros(count, 0)
         if self.frozen is not None:
@@ -121,7 +121,8 @@ class AffordanceStage:
             prefixes = self.frozen.latents(ordered.rows[:, :context])
             latents = prefixes[which, torch.from_numpy(rng.integers(0, context + 1, count))]
         frames = self.pool.draw(cloud, slot, config.proposals, rng)
-        return Questions(cloud, slot, self.dataset.clouds.points[cloud, self.pool.point[cloud, slot]], frames, latents)
+        place = self.dataset.clouds.points[cloud, self.pool.point[cloud, slot]] - self.dataset.middles[cloud]
+        return Questions(cloud, slot, place, frames, latents)
 
 
 class PriorAnswer:

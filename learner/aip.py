@@ -12,12 +12,11 @@ from torch import Tensor, nn
 from learner.configuration import AipConfig
 from learner.data import Dataset, Split
 from learner.frozen import FrozenAap
-from learner.losses import action_scoring_losses, information_gains, information_loss
+from learner.losses import action_scoring_losses, information_gains, information_loss, mean_information_loss
 from learner.metrics import correlation
 from learner.sampling import OrderedRows, draw_numbers, order_rows, spread
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aip import Aip
-from shared.networks.pointnet2 import EncodedClouds
 
 VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 21
@@ -58,10 +57,13 @@ class AipStage:
         self.parts = parts
         self.config = config
         self.frozen = frozen
+        self._inherits = config.training == "inherited"
+        if self._inherits:
+            aip.encoder.load_state_dict(frozen.aap.encoder.state_dict())
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """All of AIP but D, at one rate; nothing of AAP."""
-        own = ("actionability_encoder.", "affordance_head.")
+        """All of AIP but D and what is inherited, at one rate; nothing of AAP."""
+        own = ("actionability_encoder.", "affordance_head.", *(("encoder.",) if self._inherits else ()))
         return [ParameterGroup(tuple(p for name, p in self.aip.named_parameters() if not name.startswith(own)))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
@@ -70,16 +72,14 @@ class AipStage:
         chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
         ordered = self._order([train[number] for number in chosen], rng)
         found = self.gains(ordered)
-        encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
-        predicted = self._predict(ordered, found, encoded)
-        losses = {"critic": information_loss(predicted, found.gains, found.mask)}
-        return StepResult(losses, int(ordered.valid.sum()))
+        predicted = self._predict(ordered, found)
+        return StepResult({"critic": self._loss(predicted, found.gains, found.mask)}, int(ordered.valid.sum()))
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
         """Figures on objects not trained on.
 
-        "critic", which is the score, is to be compared with "critic_of_median", the loss of a constant.
+        "critic", which is the score, is to be compared with "critic_of_constant", the loss of the best constant.
         """
         rng = np.random.default_rng(_VALIDATION_SEED)
         rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
@@ -87,16 +87,16 @@ class AipStage:
         for start in range(0, len(rollouts), _CHUNK):
             ordered = self._order(rollouts[start : start + _CHUNK], rng)
             found = self.gains(ordered)
-            encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
-            kept_guesses.append(self._predict(ordered, found, encoded)[found.mask])
+            kept_guesses.append(self._predict(ordered, found)[found.mask])
             kept_gains.append(found.gains[found.mask])
         gains, guesses = torch.cat(kept_gains), torch.cat(kept_guesses)
         everything = torch.ones_like(gains, dtype=torch.bool)
-        critic = float(information_loss(guesses, gains, everything))
+        critic = float(self._loss(guesses, gains, everything))
+        constant = gains.mean() if self._inherits else gains.median()
         return {
             "score": critic,
             "critic": critic,
-            "critic_of_median": float((gains - gains.median()).abs().mean()),
+            "critic_of_constant": float(self._loss(constant.expand_as(gains), gains, everything)),
             "mean_gain": float(gains.mean()),
             "correlation": correlation(guesses.numpy(), gains.numpy()),
         }
@@ -123,10 +123,17 @@ class AipStage:
         repeated = [number for number in rollouts for _ in range(self.config.draws)]
         return order_rows(self.dataset, repeated, self.config.rows_per_rollout, rng)
 
-    def _predict(self, ordered: OrderedRows, found: Gains, encoded: EncodedClouds) -> Tensor:
+    def _loss(self, predicted: Tensor, gains: Tensor, mask: Tensor) -> Tensor:
+        return (mean_information_loss if self._inherits else information_loss)(predicted, gains, mask)
+
+    def _predict(self, ordered: OrderedRows, found: Gains) -> Tensor:
         """AIP scores of the tries of the context, [B, K]."""
         rows, tries = self.dataset.rows, ordered.rows[:, : found.gains.shape[1]]
-        cloud = ordered.cloud[:, : tries.shape[1]]
-        flat = self.aip.encoder.at(encoded, cloud.flatten(), rows.point[tries].flatten())
-        features = flat.reshape(*tries.shape, -1)
+        if self._inherits:
+            features = self.frozen.features[tries]
+        else:
+            encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
+            cloud = ordered.cloud[:, : tries.shape[1]]
+            flat = self.aip.encoder.at(encoded, cloud.flatten(), rows.point[tries].flatten())
+            features = flat.reshape(*tries.shape, -1)
         return self.aip.action_scores(features, rows.xyz[tries], rows.frame[tries], found.latents, found.scores)

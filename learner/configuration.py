@@ -27,6 +27,15 @@ class TrainingConfig(StrictModel):
     checkpoint_seconds: float = Field(5.0, ge=0)
 
 
+class AugmentationConfig(StrictModel):
+    """How interactions are turned before the prior, the oracle and AAP see them; not in the paper."""
+
+    mirror: bool = True
+    """Reflect half of the sets of interactions."""
+    turn_deg: float = Field(15.0, ge=0, le=180)
+    """Turn each set about the vertical by up to this much."""
+
+
 class AffordanceConfig(TrainingConfig):
     """An affordance network D, trained when its critic is done."""
 
@@ -49,6 +58,7 @@ class PriorConfig(TrainingConfig):
     """At the most; a cloud of a restart rollout has 8."""
     proposals: int = Field(100, ge=1)
     """Draws a point for the proposal loss, as published."""
+    augmentation: AugmentationConfig = AugmentationConfig()
     affordance: AffordanceConfig = AffordanceConfig()
 
 
@@ -60,18 +70,25 @@ class AapConfig(TrainingConfig):
     learns to infer them. An AAP that is already trained is fine-tuned end to end either way."""
     steps: int = Field(250, ge=1)
     learning_rate: float = Field(3e-3, gt=0)
-    batch_rollouts: int = Field(4, ge=1)
+    batch_rollouts: int = Field(12, ge=1)
+    """Rows of one rollout share what is hidden, so that few rollouts a step teach little of it."""
     rows_per_rollout: int = Field(32, ge=2)
     """At the most, drawn anew each time."""
+    validate_every: int = Field(25, ge=1)
+    patience: int = Field(8, ge=1)
     context: int = Field(8, ge=1)
     """The longest context; every shorter one, and none, is trained in the same pass."""
+    augmentation: AugmentationConfig = AugmentationConfig()
     proposed_first: float = Field(0.5, ge=0, le=1)
     """How often the tries that a policy proposed come first in the context, where a rollout has some."""
     top: int = Field(5, ge=1)
     """Best proposals whose mean score is a point's actionability, as published."""
     affordance: AffordanceConfig = AffordanceConfig()
-    distillation: float = Field(1.0, ge=0)
+    distillation: float = Field(0.3, ge=0)
     """Weight of the loss that draws z to the oracle's; privileged training only."""
+    imitation: float = Field(1.0, ge=0)
+    """Weight of the loss that draws scores to the oracle's, which are surer than single successes; privileged training
+    only."""
     inherited_rate: float = Field(0.2, ge=0, le=1)
     """Factor of the learning rate for what comes from the oracle; privileged training only."""
     oracle_steps: int = Field(250, ge=1)
@@ -81,8 +98,13 @@ class AapConfig(TrainingConfig):
 class AipConfig(TrainingConfig):
     """Adaptive Interaction Proposal."""
 
-    steps: int = Field(200, ge=1)
-    batch_rollouts: int = Field(4, ge=1)
+    training: Literal["paper", "inherited"] = "inherited"
+    """"paper": a point encoder of its own, and L1, which finds the median gain of a try. "inherited": AAP's encoder as
+    it is, so that a step may see ten times the rollouts, and squares, which find the mean gain."""
+    steps: int = Field(300, ge=1)
+    validate_every: int = Field(25, ge=1)
+    patience: int = Field(8, ge=1)
+    batch_rollouts: int = Field(24, ge=1)
     rows_per_rollout: int = Field(32, ge=2)
     context: int = Field(4, ge=1)
     """Tries of an ordered subset; each gives one target."""

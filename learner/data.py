@@ -17,6 +17,7 @@ from learner.facts import HiddenColumns, facts_of
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
 from shared.grouping import Grouping, group_cloud
+from shared.networks.actions import middle_of
 from shared.networks.configuration import NetworkConfig
 from shared.networks.pointnet2 import CloudBatch
 from shared.store.columns import INTERACTION_COLUMNS
@@ -25,7 +26,7 @@ from shared.store.tables import column_values
 from shared.vocabulary import Float32, OutcomeKind
 
 COLUMNS = (
-    *("plan_key", "rollout", "object_id", "part_mass", "joint_friction", "surface_friction", "direction", "step"),
+    *("plan_key", "rollout", "object_id", "part_mass", "joint_friction", "surface_friction", "step"),
     *("point_index", "point", "rotation", "role", "policy_version", "method", "budget", "target_part"),
     *("joint_positions", "joint_limits", "outcome", "motion", "success", "start_joint_position"),
     *("end_joint_position", "displacement"),
@@ -41,7 +42,7 @@ class Rows:
     Attributes:
         cloud: [I], index of the cloud.
         point: [I], index of p in it.
-        xyz: p, [I, 3].
+        xyz: p less the middle of what may be moved, [I, 3].
         frame: approach and forward, [I, 6].
         motion: m, [I].
         success: r as 0 or 1, [I].
@@ -77,6 +78,7 @@ class Dataset:
         task: of the store.
         clouds: every cloud once, with its neighbour indices, view frame.
         movable: [O, N].
+        middles: of the movable points, [O, 3].
         rows: labels only; rows of failed infrastructure are left out.
         rollouts: for each rollout, its rows in order of step.
         objects: for each rollout, its object's id.
@@ -85,6 +87,7 @@ class Dataset:
     task: str
     clouds: CloudBatch
     movable: Tensor
+    middles: Tensor
     rows: Rows
     rollouts: tuple[Tensor, ...]
     objects: tuple[str, ...]
@@ -120,13 +123,16 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
     index = {name: number for number, name in enumerate(sorted(set(names)))}
     points, movable, views = _read_clouds(store, list(index))
     cloud = np.array([index[name] for name in names])
-    rows = _rows(cells, cloud, points, views)
-    rollouts = _group(cells)
     batch = CloudBatch.of(points, group_all(points, config))
+    masks = torch.from_numpy(np.stack(movable))
+    middles = middle_of(batch.points, masks)
+    rows = _rows(cells, cloud, batch.points, views, middles)
+    rollouts = _group(cells)
     return Dataset(
         task=store.setting.task,
         clouds=batch,
-        movable=torch.from_numpy(np.stack(movable)),
+        movable=masks,
+        middles=middles,
         rows=rows,
         rollouts=tuple(torch.from_numpy(found) for found in rollouts),
         objects=tuple(str(cells["object_id"][found[0]]) for found in rollouts),
@@ -188,13 +194,15 @@ def _read_clouds(
     return points, movable, np.stack(views)
 
 
-def _rows(cells: dict[str, Any], cloud: NDArray[np.int64], points: list[Float32], views: NDArray[np.float64]) -> Rows:
+def _rows(
+    cells: dict[str, Any], cloud: NDArray[np.int64], points: Tensor, views: NDArray[np.float64], middles: Tensor
+) -> Rows:
     view = views[cloud]
     rotation = cells["rotation"].reshape(-1, 3, 3)
     turned = np.einsum("iab,ibc->iac", view, rotation)
     frame = np.concatenate([turned[:, :, 2], turned[:, :, 0]], axis=1)
     point = cells["point_index"].astype(np.int64)
-    if point.min() < 0 or point.max() >= len(points[0]):
+    if point.min() < 0 or point.max() >= points.shape[1]:
         raise StoreError("the store names a point that its cloud does not have; run `adaafford store verify`")
     hidden = HiddenColumns(
         part=list(zip(cells["object_id"], cells["target_part"].tolist(), strict=True)),
@@ -203,13 +211,13 @@ def _rows(cells: dict[str, Any], cloud: NDArray[np.int64], points: list[Float32]
         motion=cells["end_joint_position"] - cells["start_joint_position"],
         room=_room(cells),
         dynamics=np.stack([cells[name] for name in ("part_mass", "joint_friction", "surface_friction")], axis=1),
-        direction=cells["direction"],
         view=view,
+        middle=middles.double().numpy()[cloud],
     )
     return Rows(
         cloud=torch.from_numpy(cloud),
         point=torch.from_numpy(point),
-        xyz=torch.from_numpy(np.stack([points[c][p] for c, p in zip(cloud, point, strict=True)])),
+        xyz=(points[torch.from_numpy(cloud), torch.from_numpy(point)] - middles[torch.from_numpy(cloud)]),
         frame=torch.from_numpy(frame.astype(np.float32)),
         motion=torch.from_numpy(cells["motion"].astype(np.float32)),
         success=torch.from_numpy(cells["success"].astype(np.float32)),

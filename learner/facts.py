@@ -1,4 +1,4 @@
-"""What cannot be seen, as numbers for the oracle: hidden dynamics, the room left in the joint, and the signed hinge.
+"""What cannot be seen, as numbers for the oracle: hidden dynamics, and the ways in which the part can move.
 
 The rows do not hold a joint's axis, but every row that moved its part says something of it: a point p of a part that
 turns or slides by a small q is displaced by q (w x p + v), where (w, v) is the joint's *twist*. Its six numbers are
@@ -11,14 +11,23 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from shared.vocabulary import Direction, Float
+from shared.vocabulary import Float
 
-FACTS_WIDTH = 16
+DYNAMICS_WIDTH = 3
+WAY_WIDTH = 7
+KNOWN_WIDTH = 1
+FACTS_WIDTH = DYNAMICS_WIDTH + 2 * WAY_WIDTH + KNOWN_WIDTH
+MIN_ROOM = 0.01
+"""A part that has less room, rad or length, cannot move that way: no such motion would count as a success."""
 MIN_MOTION = 1e-3
 """Smallest motion, rad or length, that says anything of a twist."""
-RIDGE = 1e-3
+RIDGE = 1e-5
 """Keeps a twist that few rows determine small instead of wild."""
+MIN_TURNING = 0.1
+"""Length of w below which a part slides; that of a hinge is 1."""
 MAX_ROOM = 3.15
 """A joint without limits has as much room as half a turn."""
 
@@ -34,8 +43,8 @@ class HiddenColumns:
         motion: [I], signed, end minus start of the target joint; NaN where unknown.
         room: [I, 2], how far the target joint can go up and down from where it starts.
         dynamics: [I, 3], part mass, joint friction, surface friction.
-        direction: [I], names.
         view: [I, 3, 3], view frame from world frame.
+        middle: [I, 3], view frame, of what may be moved; actions are told their places from there.
     """
 
     part: list[tuple[str, int]]
@@ -44,26 +53,42 @@ class HiddenColumns:
     motion: Float
     room: Float
     dynamics: Float
-    direction: list[str]
     view: Float
+    middle: Float
 
 
 def facts_of(hidden: HiddenColumns) -> Float:
     """Facts for the oracle, [I, FACTS_WIDTH], in the view frame.
 
-    Columns: log mass, joint friction, log surface friction; four of the direction; room up and down; the twist (w, v);
-    and whether it is known.
+    Columns: log mass, joint friction, log surface friction; for each of the two ways in which the part might move, the
+    room that it has and its twist (w, v), zero where there is no room; and whether the twist is known. A joint's sign
+    is a convention of its file, so that the ways come in an order of their own (`ordered_ways`).
     """
     twists = fit_twists(hidden)
     known = [part in twists for part in hidden.part]
     twist = np.stack([twists.get(part, np.zeros(6)) for part in hidden.part]).reshape(-1, 2, 3)
-    turned = np.einsum("iab,icb->ica", hidden.view, twist).reshape(-1, 6)
-    names = list(Direction)
-    direction = np.eye(len(names))[[names.index(Direction(name)) for name in hidden.direction]]
+    turned = np.einsum("iab,icb->ica", hidden.view, twist)
+    # w x p + v is the same motion, whatever point p and v are taken from.
+    turned[:, 1] += np.cross(turned[:, 0], hidden.middle)
+    turned = turned.reshape(-1, 6)
     mass, friction, surface = hidden.dynamics.T
     numbers = np.stack([np.log(np.maximum(mass, 1e-6)), friction, np.log(np.maximum(surface, 1e-6))], axis=1)
-    room = np.clip(np.nan_to_num(hidden.room, nan=0.0, posinf=MAX_ROOM), 0.0, MAX_ROOM)
-    return np.concatenate([numbers, direction, room, turned, np.array(known, dtype=float)[:, None]], axis=1)
+    room = np.clip(np.nan_to_num(hidden.room, nan=0.0, posinf=MAX_ROOM), 0.0, MAX_ROOM)[..., None]
+    both = np.stack([turned, -turned], axis=1) * (room > MIN_ROOM)
+    ways = ordered_ways(torch.from_numpy(np.concatenate([room, both], axis=2))).numpy()
+    return np.concatenate([numbers, ways.reshape(len(ways), -1), np.array(known, dtype=float)[:, None]], axis=1)
+
+
+def ordered_ways(ways: Tensor) -> Tensor:
+    """The two ways of each part, [..., 2, WAY_WIDTH], the one about (or along) the more positive axis first.
+
+    The axis counts by its largest component; that of a twist whose w is zero is v.
+    """
+    difference = ways[..., 0, 1:] - ways[..., 1, 1:]
+    turning, sliding = difference[..., :3], difference[..., 3:]
+    axis = torch.where(turning.norm(dim=-1, keepdim=True) > MIN_TURNING, turning, sliding)
+    largest = torch.gather(axis, -1, axis.abs().argmax(dim=-1, keepdim=True))
+    return torch.where((largest < 0)[..., None], ways.flip(-2), ways)
 
 
 def fit_twists(hidden: HiddenColumns) -> dict[tuple[str, int], Float]:

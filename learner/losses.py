@@ -5,6 +5,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from shared.networks.actions import geodesic_distance
+from shared.networks.aip import SCORE_SCALE
 
 
 def action_scoring_loss(logits: Tensor, successes: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -68,6 +69,15 @@ def information_gains(losses: Tensor) -> Tensor:
 def information_loss(predicted: Tensor, gains: Tensor, mask: Tensor) -> Tensor:
     """L1 between AIP action scores and their targets (AdaAfford, AIP Action Scoring Loss)."""
     return masked_mean((predicted - gains.detach()).abs(), mask)
+
+
+def mean_information_loss(predicted: Tensor, gains: Tensor, mask: Tensor) -> Tensor:
+    """Squared error between AIP action scores and their targets, in units of `SCORE_SCALE`; not in the paper.
+
+    L1 is least at the median, and where successes are rare most tries tell nothing: the median gain of any try is
+    then about zero. What a proposal is worth is its mean gain, where squares are least.
+    """
+    return masked_mean(((predicted - gains.detach()) / SCORE_SCALE).square(), mask)
 
 
 def distillation_loss(latents: Tensor, target: Tensor, mask: Tensor) -> Tensor:

@@ -2,9 +2,8 @@
 
 from torch import Tensor, nn
 
-from learner.data import Dataset
 from learner.facts import FACTS_WIDTH
-from learner.sampling import OrderedRows
+from learner.sampling import Batch
 from shared.networks.aap import Aap, OracleEncoder
 
 
@@ -24,10 +23,7 @@ class OracleCritic(nn.Module):
             unused.requires_grad_(False)
         aap.empty_latent.requires_grad_(False)
 
-    def logits(self, dataset: Dataset, ordered: OrderedRows) -> Tensor:
+    def logits(self, batch: Batch) -> Tensor:
         """Logits of the rows' scores, [B, n]."""
-        rows, index, aap = dataset.rows, ordered.rows, self.aap
-        encoded = aap.encoder(dataset.clouds.select(ordered.clouds))
-        flat = aap.encoder.at(encoded, ordered.cloud.flatten(), rows.point[index].flatten())
-        latents = self.oracle(rows.facts[index])
-        return aap.action_logits(flat.reshape(*index.shape, -1), rows.xyz[index], rows.frame[index], latents)
+        features = batch.features(self.aap.encoder)
+        return self.aap.action_logits(features, batch.xyz, batch.frame, self.oracle(batch.facts))

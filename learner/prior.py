@@ -4,10 +4,13 @@ Its proposal network learns from successful orientations, its critic from all ro
 (see `learner.affordance`).
 """
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from learner.augmentation import draw_turns, turn_vectors
 from learner.configuration import PriorConfig
 from learner.data import Dataset, Split
 from learner.losses import action_scoring_loss, proposal_loss
@@ -45,7 +48,8 @@ class PriorStage:
         most = self.config.actions_per_cloud
         picked = [rng.permutation(self._rows_of_cloud[number])[:most] for number in chosen]
         index = torch.from_numpy(np.concatenate(picked))
-        return StepResult(self._losses(index, rng), len(index))
+        turns = draw_turns(len(chosen), self.config.augmentation, rng)
+        return StepResult(self._losses(index, rng, turns), len(index))
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -64,11 +68,16 @@ class PriorStage:
             "proposal": float(losses["proposal"]),
         }
 
-    def _losses(self, index: Tensor, rng: np.random.Generator) -> dict[str, Tensor]:
+    def _losses(self, index: Tensor, rng: np.random.Generator, turns: Tensor | None = None) -> dict[str, Tensor]:
+        """Both losses on rows, seen after a turn for each of their clouds."""
         rows, prior = self.dataset.rows, self.prior
         clouds, cloud = torch.unique(rows.cloud[index], return_inverse=True)
-        features = prior.encoder.at(prior.encoder(self.dataset.clouds.select(clouds)), cloud, rows.point[index])
+        seen = self.dataset.clouds.select(clouds)
         xyz, frames, success = rows.xyz[index], rows.frame[index], rows.success[index]
+        if turns is not None:
+            seen = replace(seen, points=turn_vectors(turns, seen.points))
+            xyz, frames = (turn_vectors(turns[cloud], vectors[:, None])[:, 0] for vectors in (xyz, frames))
+        features = prior.encoder.at(prior.encoder(seen), cloud, rows.point[index])
         succeeded = success > 0
         shape = (int(succeeded.sum()), self.config.proposals, prior.config.noise_width)
         noise = torch.from_numpy(rng.standard_normal(shape).astype(np.float32))

@@ -4,13 +4,14 @@ Shapes: B ordered sets of interactions, n rows of each (padded), K the longest c
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from learner.augmentation import turn_facts, turn_vectors
 from learner.data import Dataset
 from shared.networks.pointnet2 import CloudBatch, PointNet2
 from shared.networks.prior import Prior
@@ -83,6 +84,50 @@ def order_rows(
         rows[place, : len(order)] = order
     clouds, cloud = torch.unique(dataset.rows.cloud[torch.from_numpy(rows)], return_inverse=True)
     return OrderedRows(torch.from_numpy(rows), torch.from_numpy(valid), clouds, cloud)
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Ordered sets of interactions as networks take them.
+
+    Attributes:
+        clouds: the clouds that occur, each once.
+        cloud: [B, n], index of each row's cloud among them.
+        point: [B, n], index of p in it.
+        xyz: p less the middle of what may be moved, [B, n, 3].
+        frame: approach and forward, [B, n, 6].
+        motion: m, [B, n].
+        success: r as 0 or 1, [B, n].
+        facts: [B, n, FACTS_WIDTH].
+    """
+
+    clouds: CloudBatch
+    cloud: Tensor
+    point: Tensor
+    xyz: Tensor
+    frame: Tensor
+    motion: Tensor
+    success: Tensor
+    facts: Tensor
+
+    @classmethod
+    def of(cls, dataset: Dataset, ordered: OrderedRows, turns: Tensor | None = None) -> "Batch":
+        """Collect the rows; `turns`, [B, 3, 3], are what each set is seen after, which must share no cloud."""
+        rows, index = dataset.rows, ordered.rows
+        clouds = dataset.clouds.select(ordered.clouds)
+        xyz, frame, facts = rows.xyz[index], rows.frame[index], rows.facts[index]
+        if turns is not None:
+            owner = torch.zeros(len(ordered.clouds), dtype=torch.long)
+            owner[ordered.cloud.flatten()] = torch.arange(len(index)).repeat_interleave(index.shape[1])
+            clouds = replace(clouds, points=turn_vectors(turns[owner], clouds.points))
+            xyz, frame, facts = turn_vectors(turns, xyz), turn_vectors(turns, frame), turn_facts(turns, facts)
+        point, motion, success = rows.point[index], rows.motion[index], rows.success[index]
+        return cls(clouds, ordered.cloud, point, xyz, frame, motion, success, facts)
+
+    def features(self, encoder: PointNet2) -> Tensor:
+        """f_p|O of the rows, [B, n, feature_width]; each cloud is encoded once."""
+        flat = encoder.at(encoder(self.clouds), self.cloud.flatten(), self.point.flatten())
+        return flat.reshape(*self.point.shape, -1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from torch import Tensor
 from shared.errors import UsageError
 from shared.geometry import gripper_rotation, points_in_view, view_from_world
 from shared.grouping import group_cloud
+from shared.networks.actions import middle_of
 from shared.networks.pointnet2 import CloudBatch, EncodedClouds, PointNet2
 from shared.policy import Policy
 from shared.vocabulary import Action, Float, Float32, Interaction, Observation
@@ -39,6 +40,7 @@ class _Entry:
 
     observation: Observation
     clouds: CloudBatch
+    middle: Tensor
     encoded: dict[str, EncodedClouds]
 
 
@@ -162,7 +164,8 @@ class Adapter:
         if entry is None:
             points = points_in_view(observation)
             clouds = CloudBatch.of([points], [group_cloud(points, self.policy.config)])
-            entry = self._entries[id(observation)] = _Entry(observation, clouds, {})
+            middle = middle_of(clouds.points[0], torch.from_numpy(observation.movable))
+            entry = self._entries[id(observation)] = _Entry(observation, clouds, middle, {})
             if len(self._entries) > MAX_CACHED_OBSERVATIONS:
                 self._entries.popitem(last=False)
         self._entries.move_to_end(id(observation))
@@ -180,7 +183,9 @@ class Adapter:
         return self._encoder(module).at(self.encode(observation, module), torch.zeros_like(index), index)
 
     def _points(self, observation: Observation, points: NDArray[np.int64]) -> Tensor:
-        return self._entry(observation).clouds.points[0, torch.from_numpy(points)]
+        """Places as actions are told them, [len(points), 3]."""
+        entry = self._entry(observation)
+        return entry.clouds.points[0, torch.from_numpy(points)] - entry.middle
 
     def _interaction_code(self, interaction: Interaction) -> tuple[Tensor, Tensor]:
         index = np.array([interaction.action.point_index])

@@ -11,13 +11,17 @@ from pathlib import Path  # noqa: E402
 import pytest  # noqa: E402
 
 OBJECTS_VARIABLE = "ADAAFFORD_OBJECTS"
+BESIDE = Path(__file__).parents[2] / "shared" / "partnet_mobility"
+"""Where real objects are looked for when the variable is unset: beside the checkout."""
+if BESIDE.is_dir():
+    os.environ.setdefault(OBJECTS_VARIABLE, str(BESIDE))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what needs real objects where there are none, and say why."""
     if os.environ.get(OBJECTS_VARIABLE):
         return
-    reason = f"{OBJECTS_VARIABLE} does not name a folder of PartNet-Mobility objects"
+    reason = f"{OBJECTS_VARIABLE} names no folder of PartNet-Mobility objects, and {BESIDE} is not there"
     for item in items:
         if item.get_closest_marker("real_objects"):
             item.add_marker(pytest.mark.skip(reason=reason))

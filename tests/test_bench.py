@@ -1,6 +1,8 @@
 """Benchmarks of collection: what they print can be relied on, and nothing is wrong with their arithmetic."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -142,3 +144,14 @@ def test_what_is_not_a_number_becomes_null_and_an_unwritable_folder_is_named(tmp
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="file"):
         keep({}, tmp_path / "file", "name")
+
+
+@pytest.mark.slow
+def test_a_fleet_makes_what_one_worker_makes(objects: Path) -> None:
+    flags = ["--rollouts", "2", "--repeats", "1", "--sample", "1", "--collection.rollout.interactions", "2"]
+    script = "from cluster.cli import main; main()"  # In a process of its own: Ray wants to be imported before SAPIEN.
+    command = [sys.executable, "-c", script, "bench", "collect", "--objects", str(objects), *flags]
+    done = subprocess.run([*command, "--workers", "2", "--json"], capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["same_digest"] is True
+    assert found["workers_speedup"] > 0

@@ -9,8 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from learner.augmentation import draw_turns, turn_facts
+from learner.configuration import AugmentationConfig
 from learner.data import Dataset, load_dataset, split
-from learner.facts import FACTS_WIDTH, HiddenColumns, facts_of, fit_twists
+from learner.facts import DYNAMICS_WIDTH, FACTS_WIDTH, WAY_WIDTH, HiddenColumns, facts_of, fit_twists
 from learner.losses import (
     action_scoring_loss,
     distillation_loss,
@@ -20,10 +22,10 @@ from learner.losses import (
     top_score,
 )
 from learner.metrics import area_under_roc, best_f_score, discrimination, f_score
-from learner.sampling import order_rows
+from learner.sampling import Batch, order_rows
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
-from shared.networks.actions import orthonormal_frames
+from shared.networks.actions import middle_of, orthonormal_frames
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
 from shared.store.store import Store
@@ -70,8 +72,9 @@ def test_every_cloud_is_there_once_and_every_row_in_the_view_frame(
         for interaction, row in zip(rollout.interactions, index.tolist(), strict=True):
             view = view_from_world(rollout.observations[interaction.observation].world_from_camera)
             cloud = dataset.clouds.points[dataset.rows.cloud[row]]
-            assert torch.equal(cloud[dataset.rows.point[row]], dataset.rows.xyz[row])
-            np.testing.assert_allclose(dataset.rows.xyz[row], view @ interaction.action.point, atol=1e-6)
+            middle = cloud[dataset.movable[dataset.rows.cloud[row]]].mean(dim=0)
+            torch.testing.assert_close(cloud[dataset.rows.point[row]] - middle, dataset.rows.xyz[row])
+            np.testing.assert_allclose(dataset.rows.xyz[row] + middle, view @ interaction.action.point, atol=1e-6)
             expected = np.concatenate([view @ interaction.action.approach, view @ interaction.action.forward])
             np.testing.assert_allclose(dataset.rows.frame[row], expected, atol=1e-6)
             assert bool(dataset.rows.success[row]) == interaction.outcome.success
@@ -149,8 +152,8 @@ def hidden_of(points: np.ndarray, displacements: np.ndarray, motions: np.ndarray
         motion=motions,
         room=np.tile([np.inf, 0.0], (count, 1)),
         dynamics=np.ones((count, 3)),
-        direction=["clockwise"] * count,
         view=np.tile(np.eye(3), (count, 1, 1)),
+        middle=np.zeros((count, 3)),
     )
 
 
@@ -171,7 +174,69 @@ def test_facts_of_a_part_that_never_moved_say_so() -> None:
     facts = facts_of(hidden)
     assert facts.shape == (2, FACTS_WIDTH)
     assert np.isfinite(facts).all()
-    assert (facts[:, -7:] == 0).all()
+    ways = facts[:, DYNAMICS_WIDTH:-1].reshape(2, 2, WAY_WIDTH)
+    assert (ways[..., 1:] == 0).all()
+    assert (facts[:, -1] == 0).all()
+
+
+def test_facts_do_not_depend_on_which_way_a_file_counts_a_joint() -> None:
+    rng = np.random.default_rng(1)
+    points, motions = rng.uniform(-0.5, 0.5, (30, 3)), rng.uniform(0.05, 0.4, 30)
+    displacements = turned(points, np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.3, 0.0]), motions)
+    room = np.tile([2.0, 0.0], (30, 1))
+    one = dataclasses.replace(hidden_of(points, displacements, motions), room=room)
+    other = dataclasses.replace(one, motion=-one.motion, room=room[:, ::-1])
+    np.testing.assert_allclose(facts_of(one), facts_of(other), atol=1e-6)
+
+
+def test_facts_tell_the_same_motion_from_any_middle() -> None:
+    rng = np.random.default_rng(1)
+    points, motions = rng.uniform(-0.5, 0.5, (30, 3)), rng.uniform(0.05, 0.2, 30)
+    displacements = turned(points, np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.3, 0.0]), motions)
+    hidden = hidden_of(points, displacements, motions)
+    middle = np.array([0.2, -0.4, 0.3])
+    for one, place in (
+        (hidden, points),
+        (dataclasses.replace(hidden, middle=np.tile(middle, (30, 1))), points - middle),
+    ):
+        w, v = facts_of(one)[:, 1 + DYNAMICS_WIDTH : DYNAMICS_WIDTH + WAY_WIDTH].reshape(30, 2, 3).swapaxes(0, 1)
+        np.testing.assert_allclose((np.cross(w, place) + v) * motions[:, None], displacements, atol=0.02)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_facts_turn_as_the_object_does(mirrored: bool) -> None:
+    rng = np.random.default_rng(2)
+    turn = draw_turns(1, AugmentationConfig(mirror=False, turn_deg=60.0), rng)
+    if mirrored:
+        turn = turn @ torch.diag(torch.tensor([1.0, -1.0, 1.0]))
+    matrix = turn[0].double().numpy()
+    points, motions = rng.uniform(-0.5, 0.5, (30, 3)), rng.uniform(0.05, 0.2, 30)
+    displacements = turned(points, np.array([0.6, 0.0, 0.8]), np.array([0.1, 0.3, 0.0]), motions)
+    hidden = hidden_of(points, displacements, motions)
+    seen = dataclasses.replace(hidden, point=points @ matrix.T, displacement=displacements @ matrix.T)
+    before = torch.from_numpy(facts_of(hidden).astype(np.float32))[None]
+    np.testing.assert_allclose(turn_facts(turn, before)[0].numpy(), facts_of(seen), atol=1e-3)
+
+
+def test_turns_keep_the_vertical_and_all_lengths() -> None:
+    turns = draw_turns(50, AugmentationConfig(), np.random.default_rng(0))
+    torch.testing.assert_close(turns @ turns.mT, torch.eye(3).expand(50, 3, 3))
+    assert (turns[:, 2] == torch.tensor([0.0, 0.0, 1.0])).all()
+    assert set(torch.linalg.det(turns).round().tolist()) == {-1.0, 1.0}
+
+
+def test_a_batch_is_turned_as_one(dataset: Dataset) -> None:
+    ordered = order_rows(dataset, [0, 1, 2], 12, np.random.default_rng(0))
+    turns = draw_turns(3, AugmentationConfig(turn_deg=90.0), np.random.default_rng(3))
+    batch = Batch.of(dataset, ordered, turns)
+    plain = Batch.of(dataset, ordered)
+    # A row's point is still the point of its cloud that it names.
+    middles = middle_of(batch.clouds.points, dataset.movable[ordered.clouds])
+    torch.testing.assert_close(batch.clouds.points[batch.cloud, batch.point] - middles[batch.cloud], batch.xyz)
+    for one, other in ((batch.frame[..., :3], plain.frame[..., :3]), (batch.xyz, plain.xyz)):
+        torch.testing.assert_close(one.norm(dim=-1), other.norm(dim=-1))
+    along, before = ((b.xyz * b.frame[..., :3]).sum(-1) for b in (batch, plain))
+    torch.testing.assert_close(along, before)
 
 
 def test_metrics_of_an_example_worked_by_hand() -> None:

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from shared.grouping import group_cloud
 from shared.networks.aap import Aap
-from shared.networks.actions import action_inputs, geodesic_distance, orthonormal_frames
+from shared.networks.actions import MOMENT_SCALE, action_inputs, geodesic_distance, orthonormal_frames
 from shared.networks.configuration import NETWORKS, NetworkConfig
 from shared.networks.layers import Head
 from shared.networks.pointnet2 import CloudBatch, PointNet2
@@ -107,7 +107,7 @@ def test_geodesic_distance_is_the_angle() -> None:
 def test_action_features_hold_the_moment() -> None:
     point, frame = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
     inputs = action_inputs(point, frame, TINY)
-    torch.testing.assert_close(inputs[9:], torch.tensor([0.0, 0.0, 1.0]))
+    torch.testing.assert_close(inputs[9:], MOMENT_SCALE * torch.tensor([0.0, 0.0, 1.0]))
     plain = TINY.model_copy(update={"action_features": False})
     assert torch.equal(action_inputs(point, frame, plain), frame)
 
@@ -129,15 +129,16 @@ def test_latent_forgets_the_order(count: int, seed: int) -> None:
     torch.testing.assert_close(module.latent(z[order], w[order]), module.latent(z, w), rtol=1e-4, atol=1e-5)
 
 
-def test_latents_of_prefixes_are_the_latents_of_the_prefixes() -> None:
-    module = Aap(TINY)
+@pytest.mark.parametrize("evidence", [False, True])
+def test_latents_of_prefixes_are_the_latents_of_the_prefixes(evidence: bool) -> None:
+    module = Aap(TINY.model_copy(update={"evidence": evidence}))
     z, w = codes(module, 9)
     prefixes = module.prefix_latents(z, w)
     assert torch.equal(prefixes[0], module.empty_latent)
     for k in range(1, 10):
-        mean = (z[:k] * w[:k, None]).sum(0) / w[:k].sum()
-        torch.testing.assert_close(prefixes[k], mean, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(prefixes[k], module.latent(z[:k], w[:k]), rtol=1e-4, atol=1e-5)
+        mean = (z[:k] * w[:k, None]).sum(0) / w[:k].sum()
+        assert torch.allclose(prefixes[k], mean, rtol=1e-4, atol=1e-5) != evidence
 
 
 def test_attention_weights_are_positive_whatever_the_weights_say() -> None:

@@ -10,9 +10,9 @@ from typing import Any
 
 from cluster.benchmarks.collecting import ROLLOUTS_PER_SHARD
 from cluster.benchmarks.progress import Advance
+from cluster.fleet import make_worker
 from cluster.ray_fleet import RayFleet
 from cluster.session import ray_session
-from collector.worker import Worker
 from shared.plan import Job, Plan
 from shared.store import Store
 
@@ -40,7 +40,7 @@ def speedup(plan: Plan, folder: Path, rollouts: int, repeats: int, workers: int,
         stores, fleets = [], []
         for count in (1, workers):
             store = Store.create(Path(scratch) / f"store-{count}", plan.setting)
-            fleet = RayFleet(partial(Worker, store.path, folder), count, JOB_LIMIT_S)
+            fleet = RayFleet(partial(make_worker, store.path, folder), count, JOB_LIMIT_S)
             stack.callback(fleet.close)
             stores.append(store)
             fleets.append(fleet)

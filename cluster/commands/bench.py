@@ -152,6 +152,9 @@ def _dynamics(command: DynamicsSettings) -> int:
 
 
 def _collect(command: CollectSettings) -> int:
+    if command.workers > 1:
+        # Before SAPIEN and torch: where their libraries come first, Ray's start may abort in std::regex.
+        import ray  # noqa: F401
     from cluster.benchmarks.collecting import CollectionBenchmark
     from cluster.benchmarks.progress import progress
 

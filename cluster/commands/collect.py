@@ -68,10 +68,10 @@ def main(args: list[str]) -> int:
 
 def _collect(command: CollectCommand) -> None:
     from cluster.collection import collect
+    from cluster.fleet import make_worker
     from cluster.locking import only_driver
     from cluster.objects import objects_for
     from cluster.session import fleets
-    from collector.worker import Worker
     from shared.plan import Plan, Setting
     from shared.store import Store
 
@@ -92,5 +92,5 @@ def _collect(command: CollectCommand) -> None:
     store = Store.create(path, setting)
     plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
     with only_driver(path), fleets(chosen.workers, chosen.job_limit_s, chosen.ray_address) as make_fleet:
-        open_fleet = partial(make_fleet, partial(Worker, path, folder))
+        open_fleet = partial(make_fleet, partial(make_worker, path, folder))
         collect(store, plan, chosen.rollouts, chosen.per_shard, open_fleet, folder)

@@ -29,11 +29,12 @@ class Aap(nn.Module):
         self.encoder = PointNet2(config)
         self.action_encoder = VectorEncoder(action_width(config), config)
         self.outcome_encoder = VectorEncoder(outcome_width(config), config)
-        self.code_head = Head((width, width, width), latent, config)
+        self.code_head = Head((width, width, width), latent, config, product=config.products)
         self.attention_head = Head((width, width, width), 1, config)
+        self.evidence_head = Head((latent, latent), latent, config) if config.evidence else None
         self.empty_latent = nn.Parameter(torch.zeros(latent))
-        self.critic_head = Head((width, width, latent), 1, config)
-        self.affordance_head = Head((width, latent), 1, config)
+        self.critic_head = Head((width, width, latent), 1, config, product=config.products)
+        self.affordance_head = Head((width, latent), 1, config, product=config.products)
 
     def interaction_codes(
         self, features: Tensor, points: Tensor, frames: Tensor, motions: Tensor, successes: Tensor
@@ -44,7 +45,7 @@ class Aap(nn.Module):
 
         Args:
             features: f_p|O at each interaction's point, [..., feature_width].
-            points: p, [..., 3].
+            points: p less the middle of what may be moved, [..., 3].
             frames: approach and forward, [..., 6].
             motions: m, [...].
             successes: r as 0 or 1, [...].
@@ -61,6 +62,9 @@ class Aap(nn.Module):
     def prefix_latents(self, codes: Tensor, weights: Tensor) -> Tensor:
         """The z of every prefix of ordered interactions, in one pass: sum z_i w_i / sum w_i.
 
+        Deviation, where `config.evidence` is set: a mean forgets how many tries agreed, so that a small perceptron
+        corrects it by the mean grown with the total weight.
+
         Deviation: the paper leaves z of no interactions undefined; here it is a learned constant, so that "AAP with no
         tries" is a prediction like the others.
 
@@ -71,8 +75,10 @@ class Aap(nn.Module):
         Returns:
             [..., K + 1, latent_width], from no interactions to all K.
         """
-        sums = (codes * weights[..., None]).cumsum(dim=-2)
-        means = sums / weights.cumsum(dim=-1)[..., None]
+        sums, totals = (codes * weights[..., None]).cumsum(dim=-2), weights.cumsum(dim=-1)[..., None]
+        means = sums / totals
+        if self.evidence_head is not None:
+            means = means + self.evidence_head(means, means * torch.log1p(totals))
         return torch.cat([self.empty_latent.expand(*codes.shape[:-2], 1, -1), means], dim=-2)
 
     def latent(self, codes: Tensor, weights: Tensor) -> Tensor:
@@ -84,7 +90,7 @@ class Aap(nn.Module):
 
         Args:
             features: f_p|O, [..., feature_width].
-            points: p, [..., 3].
+            points: p less the middle of what may be moved, [..., 3].
             frames: approach and forward, [..., 6].
             latents: z, [..., latent_width].
 

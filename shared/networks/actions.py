@@ -12,6 +12,10 @@ from shared.networks.configuration import NetworkConfig
 FRAME_WIDTH = 6
 MOTION_SCALE = 0.01
 """The motion that counts as a success, tau of the paper; log(1 + m / tau) spreads small motions out."""
+PLACE_SCALE = 3.0
+"""Places on an object, a few tenths of a unit, come to about 1."""
+MOMENT_SCALE = 10.0
+"""Lever arms that decide whether a part turns, some hundredths of a unit, come to some tenths."""
 _DEGENERATE = 1e-4
 """Length below which a direction is mostly rounding."""
 
@@ -25,17 +29,30 @@ def action_inputs(points: Tensor, frames: Tensor, config: NetworkConfig) -> Tens
     """The numbers that describe actions, [..., action_width].
 
     Deviation from the paper, where `config.action_features` is set: p and the approach's moment p x d are added, in the
-    gravity-aligned view frame, since whether a push turns a hinge is linear in them.
+    gravity-aligned view frame, since whether a push turns a hinge is linear in them. They are taken from the middle of
+    what may be moved (`middle_of`), close to a knob's axis and half-way between the two edges where a door may hang.
 
     Args:
-        points: p, [..., 3], broadcast against the frames.
+        points: p less the middle, [..., 3], broadcast against the frames.
         frames: approach and forward, [..., 6].
         config: the sizes.
     """
     if not config.action_features:
         return frames
     places = points.expand(*frames.shape[:-1], 3)
-    return torch.cat([frames, places, torch.linalg.cross(places, frames[..., :3])], dim=-1)
+    moments = torch.linalg.cross(places, frames[..., :3])
+    return torch.cat([frames, PLACE_SCALE * places, MOMENT_SCALE * moments], dim=-1)
+
+
+def middle_of(points: Tensor, movable: Tensor) -> Tensor:
+    """The mean of a cloud's movable points, [..., 3]; of all of them where none is.
+
+    Args:
+        points: [..., N, 3].
+        movable: [..., N].
+    """
+    counted = torch.where(movable.any(dim=-1, keepdim=True), movable, torch.ones_like(movable))[..., None]
+    return (points * counted).sum(dim=-2) / counted.sum(dim=-2)
 
 
 def outcome_width(config: NetworkConfig) -> int:

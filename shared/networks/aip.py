@@ -26,7 +26,7 @@ class Aip(nn.Module):
         self.action_encoder = VectorEncoder(action_width(config), config)
         self.score_encoder = VectorEncoder(1, config)
         self.actionability_encoder = VectorEncoder(1, config)
-        self.critic_head = Head((width, width, width, latent), 1, config)
+        self.critic_head = Head((width, width, width, latent), 1, config, product=config.products)
         self.affordance_head = Head((width, width, latent), 1, config)
 
     def action_scores(
@@ -36,13 +36,13 @@ class Aip(nn.Module):
 
         Args:
             features: f_p|O of this module, [..., feature_width].
-            points: p, [..., 3].
+            points: p less the middle of what may be moved, [..., 3].
             frames: approach and forward, [..., 6].
             latents: z, [..., latent_width].
             aap_scores: s^AAP_u|z, probabilities, [...].
         """
         actions = self.action_encoder(action_inputs(points, frames, self.config))
-        scores: Tensor = self.critic_head(features, actions, self.score_encoder(aap_scores[..., None]), latents)
+        scores: Tensor = self.critic_head(features, self.score_encoder(aap_scores[..., None]), actions, latents)
         return SCORE_SCALE * scores.squeeze(-1)
 
     def actionability(self, features: Tensor, latents: Tensor, aap_actionability: Tensor) -> Tensor:

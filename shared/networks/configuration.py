@@ -38,6 +38,11 @@ class NetworkConfig(StrictModel):
     """Whether an action enters with p and p x d, beside approach and forward. As published: not."""
     outcome_features: bool = True
     """Whether an outcome enters with log(1 + m / tau) and r, beside the motion m. As published: not."""
+    products: bool = True
+    """Whether actions are multiplied with z and with outcomes, and AAP's D multiplies points with z (see
+    `shared.networks.layers.Head`). As published: not."""
+    evidence: bool = True
+    """Whether z is told how much was tried, beside the mean of what the tries say. As published: not."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "NetworkConfig":
@@ -62,6 +67,8 @@ NETWORKS = {
         normalisation="batch",
         action_features=False,
         outcome_features=False,
+        products=False,
+        evidence=False,
     ),
 }
 """Named configurations: "small" for clouds of about 2,048 points on a few cores, and "published"."""

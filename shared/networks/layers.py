@@ -61,9 +61,15 @@ class Head(nn.Module):
     The first layer is kept as one matrix an input, whose products are added: the same function as one matrix on the
     concatenation, except that inputs whose leading axes broadcast (a point's feature against a hundred rotations, or
     an action against every latent) are multiplied once and never copied.
+
+    Deviation, where `product` is set: the hidden layer also gets the product of projections of the last two inputs.
+    Whether a push at p along d turns a hinge is bilinear in the action and in what is known of the hinge, which sums
+    alone learn from far more data.
     """
 
-    def __init__(self, widths_in: Sequence[int], width_out: int, config: NetworkConfig) -> None:
+    def __init__(
+        self, widths_in: Sequence[int], width_out: int, config: NetworkConfig, *, product: bool = False
+    ) -> None:
         super().__init__()
         whole = nn.Linear(sum(widths_in), config.feature_width)
         # Drawn as one layer, so that the spread of the weights is that of the concatenation.
@@ -71,6 +77,9 @@ class Head(nn.Module):
             nn.Parameter(part.clone()) for part in torch.split(whole.weight.detach(), list(widths_in), dim=1)
         )
         self.bias = nn.Parameter(whole.bias.detach().clone())
+        self.factors = nn.ModuleList(
+            nn.Linear(width, config.feature_width) for width in (widths_in[-2:] if product else ())
+        )
         self.output = nn.Linear(config.feature_width, width_out)
 
     def forward(self, *inputs: Tensor) -> Tensor:
@@ -78,6 +87,9 @@ class Head(nn.Module):
         hidden: Tensor = self.bias
         for weight, x in zip(self.inputs, inputs, strict=True):
             hidden = hidden + functional.linear(x, weight)
+        if len(self.factors):
+            one, other = (factor(x) for factor, x in zip(self.factors, inputs[-2:], strict=True))
+            hidden = hidden + one * other
         return _as_tensor(self.output(functional.leaky_relu(hidden)))
 
 

@@ -43,7 +43,7 @@ class Prior(nn.Module):
 
         Args:
             features: f_p|O, [..., feature_width], broadcast against the frames.
-            points: p, [..., 3], broadcast against the frames.
+            points: p less the middle of what may be moved, [..., 3], broadcast against the frames.
             frames: approach and forward, [..., 6].
         """
         actions = self.action_encoder(action_inputs(points, frames, self.config))
