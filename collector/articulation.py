@@ -93,3 +93,16 @@ def joint_motion(joint: Joint, position: float) -> Float:
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     motion[:3, :3] = np.eye(3) + np.sin(position) * cross + (1 - np.cos(position)) * (cross @ cross)
     return motion
+
+
+def joint_twist(joint: Joint, world_from_body: Float) -> Float:
+    """(w, v), [6], world frame: a point p of the body starts to move by w x p + v a unit of joint position.
+
+    Args:
+        joint: that the body hangs on.
+        world_from_body: [4, 4], the body's pose; the axis passes through its origin.
+    """
+    axis = world_from_body[:3, :3] @ joint.axis
+    if joint.kind == "prismatic":
+        return np.concatenate([np.zeros(3), axis])
+    return np.concatenate([axis, np.cross(world_from_body[:3, 3], axis)])

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from collector.articulation import joint_twist
 from collector.clock import StageClock
 from collector.environment import SapienEnvironment
 from collector.primitives import hand_start
@@ -34,6 +35,7 @@ class Recorder:
         body = environment.object.bodies[part]
         assert body.joint is not None
         positions, limits = environment.scene.joint_positions(), environment.scene.limits.copy()
+        twist = joint_twist(body.joint, environment.scene.body_pose(part))
         begun = time.perf_counter()
         outcome = environment.execute(action)
         self.interactions.append(
@@ -53,8 +55,10 @@ class Recorder:
                 target_part=part,
                 target_link=body.link,
                 target_joint=body.joint.name,
+                joint_names=tuple(each.joint.name for each in environment.object.parts if each.joint is not None),
                 joint_positions=positions,
                 joint_limits=limits,
+                joint_twist=twist,
                 hand_start=np.concatenate([hand_start(action), quaternion_from_rotation(action.rotation)]),
                 seconds=time.perf_counter() - begun,
             )

@@ -26,8 +26,11 @@ class InteractionRecord:
         target_part: 1-based movable part that p lies on.
         target_link: its link's name in the URDF.
         target_joint: its joint's name in the URDF.
-        joint_positions: of all movable joints at the start, in part order.
+        joint_names: of all movable joints in the URDF, in part order.
+        joint_positions: theirs at the start.
         joint_limits: [parts, 2], limits that were in force (the direction modes change them).
+        joint_twist: [6], hidden: (w, v) of the target joint at the start, world frame. A point p of the part starts to
+            move by w x p + v a unit of joint position, so w is a hinge's signed axis, and v a slide's.
         hand_start: [7], world pose of the hand frame at the start, xyz then quaternion wxyz.
         seconds: wall time; not part of the content digest.
     """
@@ -47,8 +50,10 @@ class InteractionRecord:
     target_part: int
     target_link: str
     target_joint: str
+    joint_names: tuple[str, ...]
     joint_positions: Float
     joint_limits: Float
+    joint_twist: Float
     hand_start: Float
     seconds: float
 

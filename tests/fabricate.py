@@ -140,8 +140,10 @@ def fabricate_interaction(
         target_part=part,
         target_link=f"link_{part}",
         target_joint=f"joint_{part}",
+        joint_names=tuple(f"joint_{k}" for k in range(1, parts + 1)),
         joint_positions=rng.uniform(0.0, 1.0, parts),
         joint_limits=np.stack([np.zeros(parts), rng.uniform(1.0, 2.0, parts)], axis=1),
+        joint_twist=rng.normal(size=6),
         hand_start=rng.normal(size=7),
         seconds=rng.uniform(0.01, 0.04),
     )

@@ -152,6 +152,17 @@ def test_points_and_normals_of_rows_are_those_of_their_clouds(objects: Path) -> 
         assert np.linalg.norm(row.hand_start[:3] + 0.15 * row.action.approach - row.action.point) < 1e-9
 
 
+def test_the_recorded_twist_says_where_the_touched_point_goes(objects: Path) -> None:
+    rows = [row for index in range(4) for row in rollout(plan_for(objects), objects, index).interactions]
+    moved = [row for row in rows if row.outcome.success and row.outcome.motion < 0.2]
+    assert moved
+    for row in moved:
+        signed = row.outcome.end_joint_position - row.outcome.start_joint_position
+        expected = signed * (np.cross(row.joint_twist[:3], row.action.point) + row.joint_twist[3:])
+        assert row.outcome.displacement == pytest.approx(expected, abs=0.15 * np.linalg.norm(expected) + 1e-4)
+        assert row.joint_names[row.target_part - 1] == row.target_joint
+
+
 def test_evaluation_gives_every_method_the_same_start_and_the_same_questions(objects: Path) -> None:
     evaluation = EvaluationConfig(methods=("where2act", "ours-random", "ours-final"), budgets=(1, 2), queries=3)
     plan = plan_for(objects, kind="evaluation", evaluation=evaluation)

@@ -1,5 +1,6 @@
 """The columns of the two tables: one list that the writer, the reader, the digest and the schema all follow."""
 
+import json
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -175,8 +176,10 @@ def _choice_columns() -> tuple[Column[InteractionRow], ...]:
         Column("target_part", "<i4", 0, "1-based movable part under p", lambda x: i(x).target_part),
         Column("target_link", "", 0, "its link", lambda x: i(x).target_link),
         Column("target_joint", "", 0, "its joint", lambda x: i(x).target_joint),
+        Column("joint_names", "", 0, "all joints, a JSON list", lambda x: json.dumps(list(i(x).joint_names))),
         Column("joint_positions", "<f8", LIST, "all joints at the start", lambda x: i(x).joint_positions),
         Column("joint_limits", "<f8", LIST, "lower, upper of each joint", lambda x: i(x).joint_limits.ravel()),
+        Column("joint_twist", "<f8", 6, "hidden: (w, v) of the target joint, world", lambda x: i(x).joint_twist),
         Column("hand_start", "<f8", 7, "hand at the start, world, xyz wxyz", lambda x: i(x).hand_start),
     )
 

@@ -1,6 +1,7 @@
 """Reading shards, which are hostile until their sizes, checksums, schemas and references have been checked."""
 
 import hashlib
+import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -205,8 +206,10 @@ def _interaction(row: dict[str, Any]) -> InteractionRecord:
         target_part=int(row["target_part"]),
         target_link=row["target_link"],
         target_joint=row["target_joint"],
+        joint_names=tuple(map(str, json.loads(row["joint_names"]))),
         joint_positions=row["joint_positions"],
         joint_limits=row["joint_limits"].reshape(-1, 2),
+        joint_twist=row["joint_twist"],
         hand_start=row["hand_start"],
         seconds=float(row["seconds"]),
     )

@@ -82,13 +82,16 @@ def _check_interaction(interaction: InteractionRecord, rollout: RolloutRecord) -
     _check_array("normal", interaction.normal, (3,))
     _check_array("joint positions", interaction.joint_positions, (parts,))
     _check_array("joint limits", interaction.joint_limits, (parts, 2))
+    if len(interaction.joint_names) != parts:
+        raise ValueError(f"{len(interaction.joint_names)} joint names of {parts} joints")
+    _check_array("joint twist", interaction.joint_twist, (6,))
     _check_array("hand start", interaction.hand_start, (7,))
     _check_array("displacement", outcome.displacement, (3,), nan=True)
     _check_finite("motion or seconds", [outcome.motion, interaction.seconds])
     if outcome.motion < 0:
         raise ValueError(f"motion is {outcome.motion}; it is never negative")
     texts = (interaction.proposer, interaction.method, interaction.target_link, interaction.target_joint)
-    _check_texts(*texts)
+    _check_texts(*texts, *interaction.joint_names)
 
 
 def _check_array(name: str, array: Float, shape: tuple[int, ...], *, nan: bool = False) -> None:
