@@ -22,7 +22,7 @@ class RolloutCounts(StrictModel):
     """In each later round, proposed by AIP."""
     evaluation: int = Field(8, ge=1)
     """On test objects, which are not trained on."""
-    per_shard: int = Field(2, ge=1, le=4096)
+    per_shard: int = Field(4, ge=1, le=4096)
     """A job's size: what a worker does in one go, and what a kill can cost."""
 
 

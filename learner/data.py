@@ -27,9 +27,8 @@ from shared.vocabulary import Float32, OutcomeKind
 
 COLUMNS = (
     *("plan_key", "rollout", "object_id", "part_mass", "joint_friction", "surface_friction", "step"),
-    *("point_index", "point", "rotation", "role", "policy_version", "method", "budget", "target_part"),
-    *("joint_positions", "joint_limits", "outcome", "motion", "success", "start_joint_position"),
-    *("end_joint_position", "displacement"),
+    *("point_index", "rotation", "role", "policy_version", "method", "budget", "target_part"),
+    *("joint_positions", "joint_limits", "joint_twist", "outcome", "motion", "success"),
 )
 VALIDATION_SHARE = 5
 """Without lists of objects, one object in this many is kept for validation, chosen by a hash of its id."""
@@ -205,10 +204,7 @@ def _rows(
     if point.min() < 0 or point.max() >= points.shape[1]:
         raise StoreError("the store names a point that its cloud does not have; run `adaafford store verify`")
     hidden = HiddenColumns(
-        part=list(zip(cells["object_id"], cells["target_part"].tolist(), strict=True)),
-        point=cells["point"],
-        displacement=cells["displacement"],
-        motion=cells["end_joint_position"] - cells["start_joint_position"],
+        twist=cells["joint_twist"].reshape(-1, 6),
         room=_room(cells),
         dynamics=np.stack([cells[name] for name in ("part_mass", "joint_friction", "surface_friction")], axis=1),
         view=view,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from learner.augmentation import draw_turns, turn_facts
 from learner.configuration import AugmentationConfig
 from learner.data import Dataset, load_dataset, split
-from learner.facts import DYNAMICS_WIDTH, FACTS_WIDTH, WAY_WIDTH, HiddenColumns, facts_of, fit_twists
+from learner.facts import DYNAMICS_WIDTH, WAY_WIDTH, HiddenColumns, facts_of
 from learner.losses import (
     action_scoring_loss,
     distillation_loss,
@@ -136,71 +136,47 @@ def test_proposed_tries_come_first_in_their_own_order(dataset: Dataset) -> None:
     assert sorted(ordered.rows[0].tolist()) == sorted(dataset.rollouts[2].tolist())
 
 
-def turned(points: np.ndarray, axis: np.ndarray, through: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Displacements of points that turn about an axis (Rodrigues)."""
-    arm = points - through
-    cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    return arm * cos + np.cross(axis, arm) * sin + axis * (arm @ axis)[:, None] * (1 - cos) - arm
-
-
-def hidden_of(points: np.ndarray, displacements: np.ndarray, motions: np.ndarray) -> HiddenColumns:
-    count = len(points)
+def hidden_of(axis: np.ndarray, through: np.ndarray, room: tuple[float, float] = (2.0, 0.0)) -> HiddenColumns:
+    """One row whose part turns about `axis` through a point."""
     return HiddenColumns(
-        part=[("door", 1)] * count,
-        point=points,
-        displacement=displacements,
-        motion=motions,
-        room=np.tile([np.inf, 0.0], (count, 1)),
-        dynamics=np.ones((count, 3)),
-        view=np.tile(np.eye(3), (count, 1, 1)),
-        middle=np.zeros((count, 3)),
+        twist=np.concatenate([axis, np.cross(through, axis)])[None],
+        room=np.array([room]),
+        dynamics=np.ones((1, 3)),
+        view=np.eye(3)[None],
+        middle=np.zeros((1, 3)),
     )
+
+
+def ways_of(hidden: HiddenColumns) -> np.ndarray:
+    """Room and twist of both ways, [2, WAY_WIDTH]."""
+    return facts_of(hidden)[0, DYNAMICS_WIDTH:].reshape(2, WAY_WIDTH)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("side", [-0.4, 0.4])
-def test_the_twist_tells_a_hinges_side_and_sign(side: float, sign: float) -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-0.5, -0.4, -0.5], [-0.4, 0.4, 0.5], (30, 3))
+def test_facts_tell_a_hinges_side_and_the_ways_it_may_turn(side: float, sign: float) -> None:
     axis, through = np.array([0, 0, sign]), np.array([-0.45, side, 0.0])
-    motions = rng.uniform(0.05, 0.4, 30)
-    w, v = fit_twists(hidden_of(points, turned(points, axis, through, motions), motions))["door", 1].reshape(2, 3)
-    np.testing.assert_allclose(w, axis, atol=0.05)
-    np.testing.assert_allclose(v, np.cross(through, axis), atol=0.05)
-
-
-def test_facts_of_a_part_that_never_moved_say_so() -> None:
-    hidden = hidden_of(np.ones((2, 3)), np.full((2, 3), np.nan), np.zeros(2))
-    facts = facts_of(hidden)
-    assert facts.shape == (2, FACTS_WIDTH)
-    assert np.isfinite(facts).all()
-    ways = facts[:, DYNAMICS_WIDTH:-1].reshape(2, 2, WAY_WIDTH)
-    assert (ways[..., 1:] == 0).all()
-    assert (facts[:, -1] == 0).all()
+    ways = ways_of(hidden_of(axis, through))
+    # The way about +z comes first; a joint that may only turn the other way has no room there.
+    free, shut = (0, 1) if sign > 0 else (1, 0)
+    np.testing.assert_allclose(ways[free], [2.0, *axis, *np.cross(through, axis)])
+    assert (ways[shut] == 0).all()
 
 
 def test_facts_do_not_depend_on_which_way_a_file_counts_a_joint() -> None:
-    rng = np.random.default_rng(1)
-    points, motions = rng.uniform(-0.5, 0.5, (30, 3)), rng.uniform(0.05, 0.4, 30)
-    displacements = turned(points, np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.3, 0.0]), motions)
-    room = np.tile([2.0, 0.0], (30, 1))
-    one = dataclasses.replace(hidden_of(points, displacements, motions), room=room)
-    other = dataclasses.replace(one, motion=-one.motion, room=room[:, ::-1])
+    axis, through = np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.3, 0.0])
+    one, other = hidden_of(axis, through, (2.0, 0.5)), hidden_of(-axis, through, (0.5, 2.0))
     np.testing.assert_allclose(facts_of(one), facts_of(other), atol=1e-6)
 
 
 def test_facts_tell_the_same_motion_from_any_middle() -> None:
-    rng = np.random.default_rng(1)
-    points, motions = rng.uniform(-0.5, 0.5, (30, 3)), rng.uniform(0.05, 0.2, 30)
-    displacements = turned(points, np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.3, 0.0]), motions)
-    hidden = hidden_of(points, displacements, motions)
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (30, 3))
+    hidden = hidden_of(np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.3, 0.0]))
     middle = np.array([0.2, -0.4, 0.3])
-    for one, place in (
-        (hidden, points),
-        (dataclasses.replace(hidden, middle=np.tile(middle, (30, 1))), points - middle),
-    ):
-        w, v = facts_of(one)[:, 1 + DYNAMICS_WIDTH : DYNAMICS_WIDTH + WAY_WIDTH].reshape(30, 2, 3).swapaxes(0, 1)
-        np.testing.assert_allclose((np.cross(w, place) + v) * motions[:, None], displacements, atol=0.02)
+    (w, v), (same, moved) = (
+        ways_of(one)[0, 1:].reshape(2, 3) for one in (hidden, dataclasses.replace(hidden, middle=middle[None]))
+    )
+    np.testing.assert_allclose(np.cross(same, points - middle) + moved, np.cross(w, points) + v, atol=1e-9)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -210,12 +186,11 @@ def test_facts_turn_as_the_object_does(mirrored: bool) -> None:
     if mirrored:
         turn = turn @ torch.diag(torch.tensor([1.0, -1.0, 1.0]))
     matrix = turn[0].double().numpy()
-    points, motions = rng.uniform(-0.5, 0.5, (30, 3)), rng.uniform(0.05, 0.2, 30)
-    displacements = turned(points, np.array([0.6, 0.0, 0.8]), np.array([0.1, 0.3, 0.0]), motions)
-    hidden = hidden_of(points, displacements, motions)
-    seen = dataclasses.replace(hidden, point=points @ matrix.T, displacement=displacements @ matrix.T)
-    before = torch.from_numpy(facts_of(hidden).astype(np.float32))[None]
-    np.testing.assert_allclose(turn_facts(turn, before)[0].numpy(), facts_of(seen), atol=1e-3)
+    axis, through = np.array([0.6, 0.0, 0.8]), np.array([0.1, 0.3, 0.0])
+    # A mirrored hinge turns the other way round its mirrored axis.
+    seen = hidden_of(np.linalg.det(matrix) * (matrix @ axis), matrix @ through)
+    before = torch.from_numpy(facts_of(hidden_of(axis, through)).astype(np.float32))[None]
+    np.testing.assert_allclose(turn_facts(turn, before)[0].numpy(), facts_of(seen), atol=1e-5)
 
 
 def test_turns_keep_the_vertical_and_all_lengths() -> None:

@@ -23,7 +23,7 @@ class CollectSettings(StrictModel):
     """A folder of objects in PartNet-Mobility's layout; built-in procedural objects where none is given."""
     rollouts: int = Field(100, ge=1)
     """How many the store shall hold of this plan, those of earlier attempts included."""
-    per_shard: int = Field(2, ge=1, le=4096)
+    per_shard: int = Field(4, ge=1, le=4096)
     """Rollouts a shard."""
     seed: int = Field(1, ge=0, lt=2**63)
     """Everything random derives from it."""
