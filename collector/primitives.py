@@ -100,7 +100,8 @@ class Trial:
     def run(self) -> Outcome:
         """Execute the primitive and judge it; the scene is left as the trial leaves it, the hand parked."""
         scene = self.scene
-        start = scene.joint_positions()[self.target - 1]
+        before = scene.joint_positions()
+        start = before[self.target - 1]
         body_from_world = np.linalg.inv(scene.body_pose(self.target))
         local = body_from_world @ np.append(self.action.point, 1.0)
         scene.gripper.place(self.action.rotation, hand_start(self.action), FINGER_OPEN * self.primitive.pulls)
@@ -109,6 +110,9 @@ class Trial:
             kind = OutcomeKind.OK if self._brushed else OutcomeKind.NO_CONTACT
         except _TrialEndedError as ended:
             kind = ended.kind
+        if kind is OutcomeKind.START_COLLISION:
+            # A hand cannot be where something else is; what one step of overlap did to the object never happened.
+            scene.put(before)
         end = scene.joint_positions()[self.target - 1]
         displacement = (scene.body_pose(self.target) @ local)[:3] - self.action.point
         scene.park()

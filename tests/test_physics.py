@@ -143,6 +143,20 @@ def test_the_first_contact_rule() -> None:
     assert act(beside, (-0.22, -0.4, 0.0), forward=(0.0, 1.0, 0.0)).kind is OutcomeKind.WRONG_PART
 
 
+def test_a_start_collision_leaves_the_object_where_it_was() -> None:
+    # The hand starts within the slab of a half-open door, which the engine would throw off.
+    scene = Scene(door(), EASY, FAST)
+    scene.put(np.array([0.5]))
+    world = scene.body_pose(1)
+    point = (world @ np.array([0.13, -0.4, 0.0, 1.0]))[:3]
+    action = Action(0, point, gripper_rotation(world[:3, 0], np.array([0.0, 0.0, 1.0])))
+    outcome = Trial(scene, action, 1, Primitive.PUSH, FAST).run()
+    assert outcome.kind is OutcomeKind.START_COLLISION
+    assert outcome.end_joint_position == outcome.start_joint_position
+    assert scene.settle(60, 480)
+    assert scene.joint_positions() == pytest.approx([0.5], abs=1e-4)
+
+
 def test_a_settled_scene_stays_settled() -> None:
     scene = Scene(door(), EASY, FAST)
     scene.put(np.array([0.7]))
