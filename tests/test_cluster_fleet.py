@@ -143,6 +143,7 @@ def test_an_actor_holds_at_most_two_jobs(ray_fleet: Fleet, tmp_path: Path) -> No
 
 
 def test_an_interrupt_leaves_no_actor_at_work(ray_fleet: Fleet, tmp_path: Path) -> None:
+    run(ray_fleet, 4)  # Both actors are up, so that a receipt comes before the hung job has used up its attempts.
     (tmp_path / "hang-1").write_text("9")
     with pytest.raises(KeyboardInterrupt):
         ray_fleet.run(plan(), jobs(4), lambda receipt: os.kill(os.getpid(), signal.SIGINT))
