@@ -12,8 +12,6 @@ from collector.articulation import Mesh
 from collector.engine import Assembly, Link, physx, pose, sapien
 from shared.vocabulary import Float
 
-FINGERTIP_REACH = 0.112
-"""From the hand frame's origin to the fingertips, along the approach."""
 FINGER_OFFSET = 0.0584
 """From the hand frame to a finger's, along the approach."""
 FINGER_OPEN = 0.04
