@@ -30,8 +30,7 @@ def draw_rollout(plan: Plan, index: int, attempt: int = 0) -> Draw:
     """The draw of rollout `index`; a further `attempt` draws another camera only."""
     setting, task = plan.setting, task_named(plan.setting.task)
     rng = seeds.generator(setting.seed, f"dynamics/{plan.key}", index)
-    ranges = setting.collection.dynamics or task.dynamics
-    dynamics = draw_dynamics(ranges, task, rng)
+    dynamics = draw_dynamics(setting.terms.dynamics, task, rng)
     camera = setting.collection.camera
     rng = seeds.generator(setting.seed, f"camera/{plan.key}", index, attempt)
     return Draw(

@@ -67,7 +67,7 @@ def evaluate(
         return seeds.generator(plan.setting.seed, f"{purpose}/{plan.key}", index)
 
     environment = recorder.environment
-    edge_share = plan.setting.collection.rollout.edge_share or 0.0
+    edge_share = plan.setting.terms.edge_share
     start = environment.state()
     try_from_one_state(recorder, RandomProposer(rng("queries"), edge_share), config.queries, Role.QUERY, clock)
     for name in config.methods:

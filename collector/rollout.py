@@ -61,7 +61,7 @@ def make_environment(
     return SapienEnvironment(
         target,
         task,
-        setting.collection.primitive or task.primitive,
+        setting.terms.primitive,
         draw.dynamics,
         camera_pose(draw.azimuth_deg, draw.elevation_deg, camera.distance),
         camera,
@@ -81,7 +81,8 @@ def collect(
 ) -> None:
     """Training data: what a policy proposes comes first, each try continuing the last; random tries fill the rest."""
     rollout = plan.setting.collection.rollout
-    random = RandomProposer(seeds.generator(plan.setting.seed, f"actions/{plan.key}", index), rollout.edge_share or 0.0)
+    rng = seeds.generator(plan.setting.seed, f"actions/{plan.key}", index)
+    random = RandomProposer(rng, plan.setting.terms.edge_share)
     environment = recorder.environment
     if plan.proposer != RandomProposer.name:
         first = environment.state()

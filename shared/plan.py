@@ -10,6 +10,7 @@ from typing import Literal
 from pydantic import Field
 
 from shared.configuration import CollectionConfig, StrictModel
+from shared.tasks import Terms, task_named
 
 
 class ObjectRef(StrictModel):
@@ -38,6 +39,15 @@ class Setting(StrictModel):
     objects: tuple[ObjectRef, ...] = Field(min_length=1)
     collection: CollectionConfig
     evaluation: EvaluationConfig | None = None
+
+    @property
+    def terms(self) -> Terms:
+        """What holds, whether `collection` says it or leaves it to the task.
+
+        Raises:
+            UsageError: there is no such task.
+        """
+        return task_named(self.task).terms(self.collection)
 
 
 class Plan(StrictModel):

@@ -8,6 +8,21 @@ from shared.vocabulary import Direction, Primitive
 
 
 @dataclass(frozen=True, slots=True)
+class Terms:
+    """What a configuration says, or else its task: the one place where what is left to the task is looked up.
+
+    Attributes:
+        primitive: what trials execute.
+        dynamics: what hidden dynamics are drawn from.
+        edge_share: share of random actions at points near a part's edge.
+    """
+
+    primitive: Primitive
+    dynamics: DynamicsRanges
+    edge_share: float
+
+
+@dataclass(frozen=True, slots=True)
 class Task:
     """One manipulation task.
 
@@ -34,15 +49,23 @@ class Task:
     dynamics: DynamicsRanges = DynamicsRanges()
     edge_share: float = 0.0
 
+    def terms(self, collection: CollectionConfig) -> Terms:
+        """What holds under `collection`, which may leave some of it to the task."""
+        share = collection.rollout.edge_share
+        return Terms(
+            primitive=collection.primitive or self.primitive,
+            dynamics=collection.dynamics or self.dynamics,
+            edge_share=self.edge_share if share is None else share,
+        )
+
     def resolve(self, collection: CollectionConfig) -> CollectionConfig:
         """`collection` with what it leaves to the task filled in, so that a store says all that was decided."""
-        rollout = collection.rollout
-        share = self.edge_share if rollout.edge_share is None else rollout.edge_share
+        terms = self.terms(collection)
         return collection.model_copy(
             update={
-                "primitive": collection.primitive or self.primitive,
-                "dynamics": collection.dynamics or self.dynamics,
-                "rollout": rollout.model_copy(update={"edge_share": share}),
+                "primitive": terms.primitive,
+                "dynamics": terms.dynamics,
+                "rollout": collection.rollout.model_copy(update={"edge_share": terms.edge_share}),
             }
         )
 

@@ -25,7 +25,7 @@ from shared.geometry import camera_pose
 from shared.plan import EvaluationConfig, Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import Store
-from shared.tasks import task_named
+from shared.tasks import TASKS, task_named
 from shared.vocabulary import Action, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role
 from tests.single_door import door
 
@@ -264,3 +264,16 @@ def test_a_setting_says_what_it_left_to_the_task() -> None:
     told = SMALL.model_copy(update={"rollout": RolloutConfig(edge_share=0.0)})
     assert task.resolve(told).rollout.edge_share == 0.0
     assert task.resolve(resolved) == resolved
+
+
+def test_a_setting_means_the_same_whether_it_was_resolved_or_not(objects: Path) -> None:
+    for name in TASKS:
+        written = plan_for(objects, name)
+        resolved = plan_for(objects, name, collection=task_named(name).resolve(SMALL))
+        assert written.setting.terms == resolved.setting.terms
+        assert draw_rollout(written, 3) == draw_rollout(resolved, 3)
+    points = [
+        [row.action.point_index for row in rollout(plan, objects, 1).interactions]
+        for plan in (plan_for(objects, "pull"), plan_for(objects, "pull", collection=task_named("pull").resolve(SMALL)))
+    ]
+    assert points[0] == points[1]

@@ -97,7 +97,7 @@ def measure(
     """
     trials: list[DynamicsTrial] = []
     for index in range(rollouts):
-        target = load_ref(folder, object_of(plan, index))
+        target = load_ref(folder, object_of(plan, index), plan.setting.collection.collision)
         trials.extend(_rollout(plan, target, index, draws, actions))
         advance()
     return by_category(trials)
@@ -143,11 +143,10 @@ def _rollout(plan: Plan, target: ArticulatedObject, index: int, draws: int, acti
     drawn anew: its trials count for the base rate, and are pairs only with others that rest there as well.
     """
     setting, task = plan.setting, task_named(plan.setting.task)
-    ranges = setting.collection.dynamics or task.dynamics
     rng = seeds.generator(setting.seed, "bench/dynamics", index)
     states: list[_State] = []
     for _ in range(draws):
-        environment = _environment(plan, target, index, draw_dynamics(ranges, task, rng))
+        environment = _environment(plan, target, index, draw_dynamics(setting.terms.dynamics, task, rng))
         if not environment.reset(seeds.generator(setting.seed, f"states/{plan.key}", index, 0)):
             continue
         place = _place_of(environment, states, _proposer(plan, index), actions)
@@ -168,8 +167,7 @@ def _environment(plan: Plan, target: ArticulatedObject, index: int, dynamics: Hi
 
 
 def _proposer(plan: Plan, index: int) -> RandomProposer:
-    rng = seeds.generator(plan.setting.seed, "bench/actions", index)
-    return RandomProposer(rng, plan.setting.collection.rollout.edge_share or 0.0)
+    return RandomProposer(seeds.generator(plan.setting.seed, "bench/actions", index), plan.setting.terms.edge_share)
 
 
 def _place_of(

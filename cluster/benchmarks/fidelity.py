@@ -161,10 +161,10 @@ def _with_fidelity(plan: Plan, fidelity: Fidelity) -> Plan:
 def _rollout(reference: Plan, candidate: Plan, folder: Path, index: int) -> Iterator[PairedTrial]:
     """The trials of one rollout: its object and draws are the collector's for this number."""
     seed, key = candidate.setting.seed, candidate.key
-    target, draw = load_ref(folder, object_of(candidate, index)), draw_rollout(candidate, index)
+    collision = candidate.setting.collection.collision
+    target, draw = load_ref(folder, object_of(candidate, index), collision), draw_rollout(candidate, index)
     truth, judged = (make_environment(plan, draw, target, StageClock()) for plan in (reference, candidate))
-    edge_share = candidate.setting.collection.rollout.edge_share or 0.0
-    proposer = RandomProposer(seeds.generator(seed, f"actions/{key}", index), edge_share)
+    proposer = RandomProposer(seeds.generator(seed, f"actions/{key}", index), candidate.setting.terms.edge_share)
     # Both draw the same states from streams of their own, so that both learn the same hidden direction mode.
     streams = [seeds.generator(seed, f"states/{key}", index, 0) for _ in range(2)]
     for _ in range(STATES):
