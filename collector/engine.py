@@ -82,7 +82,8 @@ class Assembly:
             parent: the link that it hangs on; None for the root.
             name: of the link.
             meshes: convex pieces; one that has no volume or cannot be cooked carries no collision.
-            joint: "fixed", "revolute" or "prismatic"; SAPIEN's joints move about or along the joint frame's x.
+            joint: "fixed", "revolute" or "prismatic"; SAPIEN's joints move about or along the joint frame's x. A root
+                that is "undefined" floats.
             joint_name: of the joint.
             parent_from_joint: [4, 4], of the joint's frame in the parent; identity where None.
             child_from_joint: [4, 4], of the joint's frame in the link; identity where None.
@@ -107,7 +108,7 @@ class Assembly:
         # The engine's defaults add friction (0.05 of the load) and air drag; ours is a drive of known limit.
         link.joint.friction = 0.0
         link.linear_damping = link.angular_damping = 0.0
-        if joint != "fixed":
+        if joint in ("revolute", "prismatic"):
             link.joint.limit = np.array([limits], dtype=np.float32)
         self._entities.append(entity)
         self.links.append(link)

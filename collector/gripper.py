@@ -1,10 +1,11 @@
-"""The flying Franka Panda hand: its collision shapes, joints and drives (figures of the published protocol).
+"""The flying Franka Panda hand: its collision shapes and drives (figures of the published protocol).
 
-The hand frame's columns are forward, left, up, where *up* is the approach direction. The hand hangs on three sliding
-and three turning joints, so that its place is a joint position and its drives are those of the published robot.
+The hand frame's columns are forward, left, up, where *up* is the approach direction. There are two ways to make it fly:
+the free one here, whose palm floats and is driven in all six directions at once, and the published one in
+`collector.jointed_gripper`, whose palm hangs on six joints and which costs the engine twice as much a step.
 """
 
-from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -18,19 +19,61 @@ FINGER_OPEN = 0.04
 """How far each finger opens."""
 ARM_STIFFNESS, ARM_DAMPING = 1000.0, 400.0
 FINGER_STIFFNESS, FINGER_DAMPING = 200.0, 60.0
-HAND_MASS, FINGER_MASS, CARRIER_MASS = 0.73, 0.015, 0.1
-"""kg. The drives are strongly overdamped, so these hardly matter; the carriers are the links between the six joints."""
-
-_NO_FACES = np.zeros((0, 3), dtype=np.int32)
-_ALONG = {
+HAND_MASS, FINGER_MASS = 0.73, 0.015
+"""kg. The drives are strongly overdamped, so these hardly matter."""
+ALONG = {
     "x": np.eye(3),
     "y": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
     "z": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
 }
 """Rotations whose first column is the named axis, since SAPIEN's joints move along or about their frame's x."""
 
+_NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
-def _frame(rotation: Float, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Float:
+
+class Gripper(Protocol):
+    """The hand in a scene, however it flies."""
+
+    palm: Link
+    fingers: tuple[Link, Link]
+
+    def place(self, rotation: Float, position: Float, opening: float) -> None:
+        """Put the hand somewhere at rest, each finger open by `opening`, with the drives holding it there.
+
+        Args:
+            rotation: [3, 3], world_from_hand.
+            position: [3], world, of the hand frame's origin; displacements count from here.
+            opening: of each finger.
+        """
+        ...
+
+    def shift(self, displacement: Float, velocity: Float) -> None:
+        """Put the hand at `displacement`, [3], from where it was placed, hand frame, moving at `velocity`, [3]."""
+        ...
+
+    def drive(self, displacement: Float) -> None:
+        """Drive the hand to `displacement`, [3], from where it was placed, hand frame."""
+        ...
+
+    def drive_velocity(self, velocity: Float) -> None:
+        """Let the drives aim at `velocity`, [3], hand frame, as well."""
+        ...
+
+    def drive_fingers(self, opening: float) -> None:
+        """Drive each finger to `opening`."""
+        ...
+
+    def opening(self) -> float:
+        """How far both fingers together are open."""
+        ...
+
+    def coordinates(self) -> Float:
+        """Everything that moves in the hand, lengths and rad or less: if none of it changes, the hand is at rest."""
+        ...
+
+
+def frame(rotation: Float, origin: Float | tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Float:
+    """A rigid matrix [4, 4]."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, origin
     return matrix
@@ -64,97 +107,103 @@ def finger() -> Mesh:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Gripper:
-    """The hand in a scene.
+class FreeGripper:
+    """A hand whose palm floats freely, drawn to its target by one drive with six degrees of freedom.
 
-    Attributes:
-        articulation: six joints of the carrier (x, y, z, then turns about x, y, z), then the two fingers.
-        joints: the same eight joints.
-        palm: the palm's link.
+    Args:
+        palm: the palm's link, root of an articulation.
         fingers: the two fingers' links.
     """
 
-    articulation: physx.PhysxArticulation
-    joints: tuple[physx.PhysxArticulationJoint, ...]
-    palm: Link
-    fingers: tuple[Link, Link]
+    def __init__(self, palm: Link, fingers: tuple[Link, Link]) -> None:
+        self.palm, self.fingers = palm, fingers
+        self._articulation = palm.articulation
+        self._drive = physx.PhysxDriveComponent(palm)
+        palm.entity.add_component(self._drive)
+        for set_property in (
+            self._drive.set_drive_property_x,
+            self._drive.set_drive_property_y,
+            self._drive.set_drive_property_z,
+            self._drive.set_drive_property_slerp,
+        ):
+            set_property(ARM_STIFFNESS, ARM_DAMPING)
+        self._rotation, self._origin = np.eye(3), np.zeros(3)
 
     def place(self, rotation: Float, position: Float, opening: float) -> None:
-        """Put the hand somewhere at rest, each finger open by `opening`, with the drives holding it there.
-
-        Args:
-            rotation: [3, 3], world_from_hand.
-            position: [3], world, of the hand frame's origin; joint positions count from here.
-            opening: of each finger.
-        """
-        self.articulation.set_root_pose(pose(_frame(rotation, tuple(position))))
-        positions = np.array([0.0] * 6 + [opening] * 2, dtype=np.float32)
-        self.articulation.set_qpos(positions)
-        self.articulation.set_qvel(np.zeros(8, dtype=np.float32))
-        for joint, target in zip(self.joints, positions, strict=True):
-            joint.set_drive_target(float(target))
-            joint.set_drive_velocity_target(0.0)
+        """See `Gripper.place`."""
+        self._rotation, self._origin = rotation, position
+        self._drive.pose_in_parent = pose(frame(rotation, position))
+        self.drive(np.zeros(3))
+        self.drive_velocity(np.zeros(3))
+        self._articulation.set_qpos(np.full(2, opening, dtype=np.float32))
+        self.drive_fingers(opening)
+        self.shift(np.zeros(3), np.zeros(3))
 
     def shift(self, displacement: Float, velocity: Float) -> None:
-        """Put the hand at `displacement`, [3], from where it was placed, hand frame, moving at `velocity`, [3]."""
-        positions, velocities = self.articulation.get_qpos(), np.zeros(8, dtype=np.float32)
-        positions[:6] = np.append(displacement, np.zeros(3))
-        velocities[:3] = velocity
-        self.articulation.set_qpos(positions)
-        self.articulation.set_qvel(velocities)
+        """See `Gripper.shift`."""
+        self._articulation.set_root_pose(pose(frame(self._rotation, self._origin + self._rotation @ displacement)))
+        self._articulation.set_root_linear_velocity(self._rotation @ velocity)
+        self._articulation.set_root_angular_velocity(np.zeros(3))
+        self._articulation.set_qvel(np.zeros(2, dtype=np.float32))
+
+    def drive(self, displacement: Float) -> None:
+        """See `Gripper.drive`."""
+        self._drive.set_drive_target(sapien.Pose(displacement))
+
+    def drive_velocity(self, velocity: Float) -> None:
+        """See `Gripper.drive_velocity`."""
+        self._drive.set_drive_velocity_target(velocity, np.zeros(3))
 
     def drive_fingers(self, opening: float) -> None:
-        """Drive each finger to `opening`."""
-        for joint in self.joints[6:]:
-            joint.set_drive_target(opening)
+        """See `Gripper.drive_fingers`."""
+        for finger_link in self.fingers:
+            finger_link.joint.set_drive_target(opening)
 
     def opening(self) -> float:
-        """How far both fingers together are open."""
-        return float(self.articulation.get_qpos()[6:].sum())
+        """See `Gripper.opening`."""
+        return float(self._articulation.get_qpos().sum())
+
+    def coordinates(self) -> Float:
+        """See `Gripper.coordinates`: palm position, its quaternion, the fingers."""
+        at = self._articulation.get_root_pose()
+        return np.concatenate([at.p, at.q, self._articulation.get_qpos()])
 
 
-def add_gripper(scene: sapien.Scene, material: physx.PhysxMaterial) -> Gripper:
-    """Build the hand into a scene, weightless, as the published gravity compensation makes it."""
+def add_gripper(scene: sapien.Scene, material: physx.PhysxMaterial) -> FreeGripper:
+    """Build the free hand into a scene, weightless, as the published gravity compensation makes it."""
     assembly = Assembly(material)
-    link = assembly.add(None, "hand-root", ())
-    for kind in ("prismatic", "revolute"):
-        for axis, along in _ALONG.items():
-            is_palm = kind == "revolute" and axis == "z"
-            link = assembly.add(
-                link,
-                "palm" if is_palm else f"carrier-{kind}-{axis}",
-                (palm(),) if is_palm else (),
-                joint=kind,
-                joint_name=f"hand-{kind}-{axis}",
-                parent_from_joint=_frame(along),
-                child_from_joint=_frame(along),
-                limits=(-10.0, 10.0),
-                touches_own_kind=False,
-            )
-    hand = link
-    for name, side in (("left", 1.0), ("right", -1.0)):
-        assembly.add(
-            hand,
-            f"finger-{name}",
-            (finger(),),
-            joint="prismatic",
-            joint_name=f"finger-{name}",
-            parent_from_joint=_frame(np.diag([side, side, 1.0]), (0.0, 0.0, FINGER_OFFSET)) @ _frame(_ALONG["y"]),
-            child_from_joint=_frame(_ALONG["y"]),
-            limits=(0.0, FINGER_OPEN),
-            touches_own_kind=False,
-        )
-    left, right = assembly.links[-2:]
-    for link in assembly.links:
-        link.disable_gravity = True
-        link.mass = HAND_MASS if link is hand else FINGER_MASS if link in (left, right) else CARRIER_MASS
-        link.inertia = np.full(3, link.mass * 1e-3, dtype=np.float32)
-    articulation = assembly.finish(scene)
-    joints = tuple(articulation.active_joints)
-    assert [j.name for j in joints[6:]] == ["finger-left", "finger-right"], "joint order is by creation"
-    for joint in joints[:6]:
-        joint.set_drive_property(ARM_STIFFNESS, ARM_DAMPING)
-    for joint in joints[6:]:
-        joint.set_drive_property(FINGER_STIFFNESS, FINGER_DAMPING)
-    return Gripper(articulation, joints, hand, (left, right))
+    hand = assembly.add(None, "palm", (palm(),), joint="undefined", touches_own_kind=False)
+    fingers = add_fingers(assembly, hand)
+    make_weightless(hand, HAND_MASS)
+    assembly.finish(scene)
+    return FreeGripper(hand, fingers)
+
+
+def add_fingers(assembly: Assembly, hand: Link) -> tuple[Link, Link]:
+    """Hang the two fingers on the palm's link `hand`, with their drives."""
+    left, right = (_add_finger(assembly, hand, *named) for named in (("left", 1.0), ("right", -1.0)))
+    return left, right
+
+
+def _add_finger(assembly: Assembly, hand: Link, name: str, side: float) -> Link:
+    link = assembly.add(
+        hand,
+        f"finger-{name}",
+        (finger(),),
+        joint="prismatic",
+        joint_name=f"finger-{name}",
+        parent_from_joint=frame(np.diag([side, side, 1.0]), (0.0, 0.0, FINGER_OFFSET)) @ frame(ALONG["y"]),
+        child_from_joint=frame(ALONG["y"]),
+        limits=(0.0, FINGER_OPEN),
+        touches_own_kind=False,
+    )
+    link.joint.set_drive_property(FINGER_STIFFNESS, FINGER_DAMPING)
+    make_weightless(link, FINGER_MASS)
+    return link
+
+
+def make_weightless(link: Link, mass: float) -> None:
+    """Give a link of the hand its mass; gravity does not act on it."""
+    link.disable_gravity = True
+    link.mass = mass
+    link.inertia = np.full(3, mass * 1e-3, dtype=np.float32)

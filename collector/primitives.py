@@ -146,20 +146,15 @@ class Trial:
 
     def _leg(self, end: Float, first: int = 0) -> None:
         """Drive the hand along a straight line to `end`, [3], hand frame, at constant speed, from step `first` on."""
-        start, steps = self._hand_at, self.fidelity.leg_steps
+        gripper, start, steps = self.scene.gripper, self._hand_at, self.fidelity.leg_steps
         velocity = (end - start) * (self.fidelity.steps_per_second / steps)
-        moving = [k for k in range(3) if velocity[k] != 0.0]
-        joints = self.scene.gripper.joints
         if first:
-            self.scene.gripper.shift(start + (end - start) * (first / steps), velocity)
-        for k in moving:
-            joints[k].set_drive_velocity_target(velocity[k])
+            gripper.shift(start + (end - start) * (first / steps), velocity)
+        gripper.drive_velocity(velocity)
         for step in range(first + 1, steps + 1):
-            for k in moving:
-                joints[k].set_drive_target(start[k] + (end[k] - start[k]) * (step / steps))
+            gripper.drive(start + (end - start) * (step / steps))
             self._step()
-        for k in moving:
-            joints[k].set_drive_velocity_target(0.0)
+        gripper.drive_velocity(np.zeros(3))
         self._hand_at = end
 
     def _free_flight(self, end: Float) -> int:
@@ -185,7 +180,7 @@ class Trial:
         for step in range(self.fidelity.hold_steps):
             self._step()
             if self.fidelity.end_holds_at_rest and step % REST_STEPS == 0:
-                now = self.scene.all_joint_positions()
+                now = self.scene.coordinates()
                 if step and np.abs(now - before).max() < REST_STEPS * REST_MOTION:
                     return
                 before = now

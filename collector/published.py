@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from collector.jointed_gripper import JointedGripper
 from collector.partnet import read_object
 from collector.primitives import Trial
 from collector.scene import Scene
@@ -70,7 +71,7 @@ class PublishedTrial(Trial):
 
     def _leg(self, end: Float, first: int = 0) -> None:
         """Drive the hand to `end`, [3], hand frame, by velocities of its joints that are computed at every step."""
-        gripper, steps, rate = self.scene.gripper, self.fidelity.leg_steps, self.fidelity.steps_per_second
+        gripper, steps, rate = _jointed(self.scene), self.fidelity.leg_steps, self.fidelity.steps_per_second
         hand, arm = gripper.articulation, gripper.joints[:6]
         palm, model = hand.links.index(gripper.palm), hand.create_pinocchio_model()
         targets, twist = np.append(self._hand_at, np.zeros(3)), np.zeros(6)
@@ -90,13 +91,14 @@ class PublishedTrial(Trial):
 
     def _hold(self) -> None:
         """Keep all drive targets for a while."""
-        hand = self.scene.gripper.articulation
-        for joint in self.scene.gripper.joints[:6]:
+        gripper = _jointed(self.scene)
+        hand = gripper.articulation
+        for joint in gripper.joints[:6]:
             joint.set_drive_velocity_target(0.0)
         for _ in range(self.fidelity.hold_steps):
             hand.set_qf(hand.compute_passive_force(gravity=False, coriolis_and_centrifugal=True))
             self._step()
-        hand.set_qf(np.zeros(len(self.scene.gripper.joints), dtype=np.float32))
+        hand.set_qf(np.zeros(len(gripper.joints), dtype=np.float32))
 
 
 def run(request: PublishedRequest) -> PublishedTiming:
@@ -133,13 +135,18 @@ def run(request: PublishedRequest) -> PublishedTiming:
 @contextmanager
 def _without_hand(scene: Scene) -> Iterator[None]:
     """The authors load their robot once the object has settled."""
-    entities = [link.entity for link in scene.gripper.articulation.links]
+    entities = [link.entity for link in _jointed(scene).articulation.links]
     world = entities[0].scene
     for entity in entities:
         world.remove_entity(entity)
     yield
     for entity in entities:
         world.add_entity(entity)
+
+
+def _jointed(scene: Scene) -> JointedGripper:
+    assert isinstance(scene.gripper, JointedGripper), "the reference fidelity has the published hand"
+    return scene.gripper
 
 
 def _settle(scene: Scene) -> float:

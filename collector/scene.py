@@ -11,6 +11,7 @@ import numpy as np
 from collector.articulation import ArticulatedObject, Joint
 from collector.engine import Assembly, Link, new_scene, physx, pose, sapien, set_mass
 from collector.gripper import Gripper, add_gripper
+from collector.jointed_gripper import add_jointed_gripper
 from shared.configuration import Fidelity
 from shared.vocabulary import Direction, Float, HiddenDynamics
 
@@ -56,7 +57,7 @@ class Scene:
     Args:
         target: the object.
         dynamics: the hidden draw, applied to every movable part.
-        fidelity: time step and solver iterations.
+        fidelity: time step, solver iterations, and how the hand flies.
 
     Attributes:
         system: SAPIEN's physics system; `system.step()` advances time.
@@ -77,7 +78,8 @@ class Scene:
         for link, joint in zip(self._links[1:], self._joints, strict=True):
             set_mass(link, dynamics.part_mass)
             joint.set_drive_property(0.0, FRICTION_DAMPING, force_limit=dynamics.joint_friction)
-        self.gripper: Gripper = add_gripper(self._scene, material)
+        add_hand = add_jointed_gripper if fidelity.jointed_hand else add_gripper
+        self.gripper: Gripper = add_hand(self._scene, material)
         self._hand = {self.gripper.palm, *self.gripper.fingers}
         self._impulse_squared = (CONTACT_FORCE / fidelity.steps_per_second) ** 2
         self.limits = target.limits()
@@ -91,9 +93,9 @@ class Scene:
         """[parts], in part order."""
         return np.asarray(self._articulation.get_qpos(), dtype=np.float64)[self._order]
 
-    def all_joint_positions(self) -> Float:
-        """Of the object, then of the hand."""
-        return np.concatenate([self._articulation.get_qpos(), self.gripper.articulation.get_qpos()])
+    def coordinates(self) -> Float:
+        """Everything that moves: the joint positions of the object, then the coordinates of the hand."""
+        return np.concatenate([self._articulation.get_qpos(), self.gripper.coordinates()])
 
     def put(self, positions: Float) -> None:
         """Put the object at rest with its joints at `positions`, [parts], and the hand out of reach.

@@ -71,11 +71,13 @@ class Fidelity(StrictModel):
     """Steps of one leg of a primitive."""
     hold_steps: int = Field(240, ge=0)
     """Steps of hold after a leg."""
-    solver_iterations: int = Field(20, ge=1, le=255)
+    solver_iterations: int = Field(10, ge=1, le=255)
     skip_free_flight: bool = True
     """Begin an approach where the hand comes within a millimetre of the object, instead of where it starts."""
     end_holds_at_rest: bool = True
     """End a hold once neither hand nor object moves."""
+    jointed_hand: bool = False
+    """Let the hand hang on six joints, as published, instead of floating freely under the same drives."""
 
 
 FIDELITIES = {
@@ -85,8 +87,10 @@ FIDELITIES = {
         steps_per_second=500,
         leg_steps=2000,
         hold_steps=2000,
+        solver_iterations=20,
         skip_free_flight=False,
         end_holds_at_rest=False,
+        jointed_hand=True,
     ),
 }
 
