@@ -20,12 +20,15 @@ COMMANDS = {
     "resume": "go on with a run that was stopped",
     "report": "print a run's results again",
     "collect": "collect interactions into a store, without any learning",
+    "train": "prior, aap, aip or alternate: train from a store alone",
     "store": "info, verify, digest or replay: look into a store",
     "objects": "generate, check, preview or decompose: the objects",
-    "bench": "fidelity, dynamics or collect: measure collection, and what its data are worth",
+    "bench": "fidelity, dynamics, collect, learner or adapt: measure how fast and how true each part is",
     "version": "print the version",
 }
 """Subcommands, each a module of `cluster.commands` with `main(args) -> int`."""
+
+RESUMABLE = ("run", "resume", "collect", "train")
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells more\n\n" + "\n".join(
     f"  {name:<9}{text}" for name, text in COMMANDS.items()
@@ -66,7 +69,7 @@ def run(args: list[str]) -> int:
 
 def _interrupted(name: str, args: list[str]) -> int:
     """Say how to go on after Ctrl-C."""
-    hint = "; what is committed stays, and the same command goes on" if name in ("run", "resume", "collect") else ""
+    hint = "; what is committed stays, and the same command goes on" if name in RESUMABLE else ""
     print(
         f"adaafford: interrupted{hint}: adaafford {' '.join(args)}" if hint else "adaafford: interrupted",
         file=sys.stderr,

@@ -66,14 +66,14 @@ class Trainer:
         out.mkdir(parents=True, exist_ok=True)
         used = self._run.objects_used()
         told = LearnerConfig(seed=self._config.seed, threads=THREADS, **dict(self._config.learner))
-        arguments = [network, "--store", str(self._run.store), "--out", str(out)]
+        arguments = ["train", network, "--store", str(self._run.store), "--out", str(out)]
         arguments += ["--config", _written(out / "learner.toml", as_toml(told.model_dump(mode="json")))]
         arguments += ["--train-objects", _written(out / "train.txt", _ids(used.train))]
         if used.validation:
             arguments += ["--validation-objects", _written(out / "validation.txt", _ids(used.validation))]
         if init is not None:
             arguments += ["--init", str(self._run.training(init))]
-        run_child("learner", arguments, out, lambda line: self._say(f"  {line}"))
+        run_child("cluster", arguments, out, lambda line: self._say(f"  {line}"))
         return {"policy_folder": str(out.relative_to(self._run.path))}
 
 
@@ -131,7 +131,7 @@ def run_child(module: str, arguments: Sequence[str], out: Path, say: Callable[[s
         finally:
             _end(child)
     if child.returncode == UsageError.exit_code:
-        raise UsageError(last.removeprefix("error: "))
+        raise UsageError(last.removeprefix("adaafford: "))
     if child.returncode != 0:
         raise WorkerError(
             f"`python -m {module} {' '.join(arguments)}` ended with code {child.returncode}; see {out / OUTPUT_FILE}"

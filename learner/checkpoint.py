@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from shared.configuration import StrictModel
-from shared.errors import StoreError
+from shared.errors import StoreError, UsageError
 from shared.files import write_atomically
 from shared.policy import check_tensors
 
@@ -61,13 +61,7 @@ def read_checkpoint(
     Raises:
         StoreError: the file is damaged, or of another network.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            cursor = Cursor.model_validate_json((file.metadata() or {}).get("cursor", ""))
-            tensors: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, ValidationError, OSError) as error:
-        line = " ".join(str(error).split())[:100]
-        raise StoreError(f"{path}: not a checkpoint ({line}); remove it to begin this stage anew") from None
+    cursor, tensors = _read(path)
     state = module.state_dict()
     current, best = _named(tensors, "module."), _named(tensors, "best.")
     check_tensors(current, state, str(path))
@@ -75,6 +69,40 @@ def read_checkpoint(
     module.load_state_dict(current)
     _load_optimiser(optimiser, _named(tensors, "optimiser."), str(path))
     return cursor, best
+
+
+def read_cursor(path: Path) -> Cursor:
+    """The cursor of a checkpoint alone.
+
+    Raises:
+        StoreError: the file is damaged or foreign.
+    """
+    return _read(path, tensors_too=False)[0]
+
+
+def check_fingerprint(cursor: Cursor, fingerprint: str, out: Path) -> None:
+    """Hold a checkpoint's cursor to the run that wants to go on from it.
+
+    Raises:
+        UsageError: it is of a run with other data or settings.
+    """
+    if cursor.fingerprint != fingerprint:
+        raise UsageError(f"{out}: holds a run with other data or settings; choose another --out")
+
+
+def _read(path: Path, *, tensors_too: bool = True) -> tuple[Cursor, dict[str, Tensor]]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            cursor = Cursor.model_validate_json((file.metadata() or {}).get("cursor", ""))
+            names = file.keys() if tensors_too else []
+            return cursor, {name: file.get_tensor(name) for name in names}
+    except ValidationError as error:
+        problem = error.errors()[0]
+        reason = f"{'.'.join(map(str, problem['loc'])) or 'cursor'}: {problem['msg']}"
+    except (SafetensorError, OSError) as error:
+        reason = str(error)
+    line = " ".join(reason.split())[:100]
+    raise StoreError(f"{path}: not a checkpoint of this version ({line}); remove it to begin this stage anew")
 
 
 def _load_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor], source: str) -> None:

@@ -116,12 +116,28 @@ class AipConfig(TrainingConfig):
     affordance: AffordanceConfig = AffordanceConfig(context=4)
 
 
+class AlternationConfig(StrictModel):
+    """When `adaafford train alternate` ends."""
+
+    rounds: int = Field(8, ge=1, le=1000)
+    """AAP and AIP are trained at most this many times."""
+    improvement: float = Field(0.01, ge=0, lt=1)
+    """A round counts if it lowers AAP's best validation loss by more than this share."""
+    patience: int = Field(1, ge=1)
+    """Rounds in a row that do not count, after which it has converged."""
+
+
 class LearnerConfig(StrictModel):
-    """Everything that `python -m learner` may be told by a file."""
+    """Everything that `adaafford train` may be told by a file."""
 
     seed: int = Field(0, ge=0)
     threads: int | None = Field(None, ge=1, le=1024)
     """Of PyTorch; unset: as many as it chooses. Bits may differ between numbers of threads."""
+    device: str = Field("auto", pattern=r"^(auto|cpu|cuda(:[0-9]{1,3})?|mps)$")
+    """auto, cpu, cuda, cuda:N or mps; "auto" takes a GPU where there is one."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Of a training step's products; "bf16" is for GPUs, and CPUs with instructions for it. Weights stay in fp32."""
+    alternation: AlternationConfig = AlternationConfig()
     network: NetworkConfig = NetworkConfig()
     prior: PriorConfig = PriorConfig()
     aap: AapConfig = AapConfig()

@@ -5,7 +5,8 @@ Shapes: O clouds, N points, I interactions.
 
 import zlib
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from learner.facts import HiddenColumns, facts_of
+from learner.hardware import moved
+from shared.configuration import MAX_CONFIGURATION_BYTES
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
 from shared.grouping import Grouping, group_cloud
@@ -81,6 +84,7 @@ class Dataset:
         rows: labels only; rows of failed infrastructure are left out.
         rollouts: for each rollout, its rows in order of step.
         objects: for each rollout, its object's id.
+        versions: for each rollout, the version of the policy that proposed in it; 0 is none.
     """
 
     task: str
@@ -90,6 +94,11 @@ class Dataset:
     rows: Rows
     rollouts: tuple[Tensor, ...]
     objects: tuple[str, ...]
+    versions: tuple[int, ...]
+
+    def on(self, device: torch.device) -> "Dataset":
+        """The same on a device; the numbers of the rollouts' rows stay, since batches are drawn on the CPU."""
+        return self if device.type == "cpu" else replace(moved(self, device), rollouts=self.rollouts)
 
     def rollouts_of(self, objects: Collection[str]) -> tuple[int, ...]:
         """Numbers of the rollouts of some objects."""
@@ -135,6 +144,7 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
         rows=rows,
         rollouts=tuple(torch.from_numpy(found) for found in rollouts),
         objects=tuple(str(cells["object_id"][found[0]]) for found in rollouts),
+        versions=tuple(int(cells["policy_version"][found].max()) for found in rollouts),
     )
 
 
@@ -169,6 +179,37 @@ def split(dataset: Dataset, train: Collection[str] | None, validation: Collectio
         if not found:
             raise UsageError(f"no rollout of the store is of an object for {name}; collect or list more objects")
     return parts
+
+
+def without_later(dataset: Dataset, parts: Split, newest: int) -> Split:
+    """The split without what policies later than `newest` proposed to learn from; what is judged by stays.
+
+    Raises:
+        UsageError: nothing is left.
+    """
+    train = tuple(number for number in parts.train if dataset.versions[number] <= newest)
+    if not train:
+        raise UsageError(f"no rollout to learn from is of policy {newest} or older; collect some at random first")
+    return Split(train, parts.validation)
+
+
+def read_object_list(path: Path | None) -> frozenset[str] | None:
+    """Object ids, one a line; what follows a blank (such as Where2Act's category) is ignored.
+
+    Raises:
+        UsageError: the file is missing, too large, not text, or lists nothing.
+    """
+    if path is None:
+        return None
+    try:
+        if path.stat().st_size > MAX_CONFIGURATION_BYTES:
+            raise UsageError(f"{path}: larger than {MAX_CONFIGURATION_BYTES} bytes; not a list of objects")
+        names = frozenset(line.split()[0] for line in path.read_text(encoding="utf-8").splitlines() if line.split())
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: cannot be read ({error}); name a text file with one object id a line") from None
+    if not names:
+        raise UsageError(f"{path}: lists no object; write one object id a line")
+    return names
 
 
 def _take(values: Any, keep: NDArray[np.int64]) -> Any:

@@ -42,6 +42,7 @@ class ProgressReport:
         limit: the most seconds of steps, if there is a limit.
         done: steps done in earlier sittings.
         live: whether to draw a bar; None: where both standard streams are terminals.
+        silent: say nothing at all, since another process speaks for this one.
         say: gets the plain lines.
         clock: seconds, monotonic.
     """
@@ -54,16 +55,17 @@ class ProgressReport:
         done: int = 0,
         *,
         live: bool | None = None,
+        silent: bool = False,
         say: Callable[[str], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._title, self._steps, self._limit, self._done = title, steps, limit, done
-        self._say = say or _print_line
+        self._say = _say_nothing if silent else say or _print_line
         self._clock = clock
         self._began = self._said = clock()
         self._bar: Progress | None = None
         self._task = TaskID(0)
-        if live or (live is None and sys.stdout.isatty() and sys.stderr.isatty()):
+        if not silent and (live or (live is None and sys.stdout.isatty() and sys.stderr.isatty())):
             self._bar = Progress(
                 TextColumn("{task.description}"),
                 BarColumn(),
@@ -127,3 +129,7 @@ def _minutes(seconds: float) -> str:
 
 def _print_line(line: str) -> None:
     print(line, flush=True)
+
+
+def _say_nothing(_: str) -> None:
+    pass

@@ -6,6 +6,7 @@ OUT/ of a stage
     checkpoint.safetensors until it is done
     affordance/            the last two of the affordance network
     oracle/                privileged AAP only: the same of the oracle critic, whose weights are in oracle.safetensors
+    tensorboard/           the metrics again, for TensorBoard, where it is installed
     weights.safetensors    the policy, all three modules
     policy.json
     done.json              written last
@@ -22,16 +23,19 @@ from typing import Literal
 import torch
 from safetensors.torch import save
 
+from learner import sharing
 from learner.aap import AapStage, OracleStage
 from learner.affordance import AapAnswer, AffordanceStage, AipAnswer, Answer, PriorAnswer
 from learner.aip import AipStage
+from learner.checkpoint import check_fingerprint, read_cursor
 from learner.configuration import AffordanceConfig, LearnerConfig, TrainingConfig
-from learner.data import Dataset, Split, load_dataset, split
+from learner.data import Dataset, Split, load_dataset, split, without_later
 from learner.frozen import FrozenAap
+from learner.hardware import Hardware
 from learner.oracle import OracleCritic
 from learner.prior import PriorStage
 from learner.sampling import ProposalPool
-from learner.training import CHECKPOINT_FILE, Stage, TrainingResult, train, without_nan
+from learner.training import CHECKPOINT_FILE, METRICS_FILE, Stage, TrainingResult, train, without_nan
 from shared.errors import UsageError
 from shared.files import read_bounded, write_atomically
 from shared.policy import MAX_POLICY_JSON_BYTES, MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE, Policy
@@ -43,6 +47,7 @@ CONFIG_FILE = "config.json"
 ORACLE_FILE = "oracle.safetensors"
 ORACLE_FOLDER = "oracle"
 AFFORDANCE_FOLDER = "affordance"
+CHECKPOINT_FOLDERS = ("", ORACLE_FOLDER, AFFORDANCE_FOLDER)
 
 StageName = Literal["prior", "aap", "aip"]
 
@@ -58,6 +63,7 @@ class StageJob:
         init: folder with the policy to start from; None: random weights (the prior only).
         train_objects: ids of the objects to learn from (see `learner.data.split`).
         validation_objects: ids of the objects to judge by.
+        newest_policy: rollouts that later policies proposed are left out of what is learnt from; None: all are in.
     """
 
     stage: StageName
@@ -66,10 +72,11 @@ class StageJob:
     init: Path | None = None
     train_objects: Collection[str] | None = None
     validation_objects: Collection[str] | None = None
+    newest_policy: int | None = None
 
 
-def run_stage(job: StageJob, config: LearnerConfig) -> Policy:
-    """Run a stage, go on with it after a kill, or return what it made where it is done.
+def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = None) -> Policy:
+    """Run a stage, go on with it after a kill, or return what it made where it is done; the policy is on the CPU.
 
     Raises:
         UsageError: the store or the policy is missing or of another task, objects leak between the parts, or `out`
@@ -79,25 +86,55 @@ def run_stage(job: StageJob, config: LearnerConfig) -> Policy:
     store = Store.open(job.store)
     policy = _initial_policy(job, store, config)
     fingerprint = _fingerprint(job, config, store, policy)
-    if (job.out / DONE_FILE).exists():
+    done = (job.out / DONE_FILE).exists()
+    # Nobody may make the folder of a finished stage before everybody has looked.
+    sharing.wait_for_all()
+    if done:
         _check_done(job.out / DONE_FILE, fingerprint)
+        _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
         return read_policy_folder(job.out)
     try:
         job.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {job.out}: cannot be made ({error.strerror}); choose another folder") from None
-    write_atomically(job.out / CONFIG_FILE, config.model_dump_json(indent=1).encode())
+    _check_checkpoints(job.out, fingerprint)
     dataset = load_dataset(store, policy.config)
     parts = split(dataset, job.train_objects, job.validation_objects)
-    result = _train(job, config, policy, dataset, parts, fingerprint)
+    if job.newest_policy is not None:
+        parts = without_later(dataset, parts, job.newest_policy)
+    _say(
+        f"{job.stage}: {len(parts.train)} rollouts to learn from, {len(parts.validation)} of other objects to judge "
+        f"by; leaves {WEIGHTS_FILE}, {POLICY_FILE} and {METRICS_FILE} in {job.out}"
+    )
+    if sharing.rank() == 0:
+        write_atomically(job.out / CONFIG_FILE, config.model_dump_json(indent=1).encode())
+    hardware = hardware or Hardware()
+    policy.modules().to(hardware.device)
+    with hardware.home():
+        runner = _Runner(job.out, config.seed, fingerprint, hardware)
+        result = _train(job, config, policy, dataset.on(hardware.device), parts, runner)
+    policy.modules().to("cpu")
     policy.with_trained(job.stage)
+    if sharing.rank() == 0:
+        _finish(job, policy, result, fingerprint)
+    sharing.wait_for_all()
+    _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
+    return policy
+
+
+def _finish(job: StageJob, policy: Policy, result: TrainingResult, fingerprint: str) -> None:
+    """Write what the stage made, and clear away what only it needed."""
     for name, data in policy.to_files().items():
         write_atomically(job.out / name, data)
     done = {"stage": job.stage, "fingerprint": fingerprint, **asdict(result), "metrics": without_nan(result.metrics)}
     write_atomically(job.out / DONE_FILE, json.dumps(done, indent=1).encode())
-    for folder in ("", ORACLE_FOLDER, AFFORDANCE_FOLDER):
+    for folder in CHECKPOINT_FOLDERS:
         (job.out / folder / CHECKPOINT_FILE).unlink(missing_ok=True)
-    return policy
+
+
+def _say(line: str) -> None:
+    if sharing.rank() == 0:
+        print(line, flush=True)
 
 
 def read_policy_folder(folder: Path) -> Policy:
@@ -133,10 +170,9 @@ def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Polic
 
 
 def _train(
-    job: StageJob, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split, fingerprint: str
+    job: StageJob, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split, runner: "_Runner"
 ) -> TrainingResult:
     rng = generator(config.seed, f"learner.{job.stage}.pool")
-    runner = _Runner(job.out, config.seed, fingerprint)
     policy.modules().eval().requires_grad_(False)
     if job.stage == "prior":
         policy.prior.requires_grad_(True)
@@ -176,11 +212,12 @@ class _Runner:
     out: Path
     seed: int
     fingerprint: str
+    hardware: Hardware
 
     def train(self, stage: Stage, settings: TrainingConfig, title: str, subfolder: str = "") -> TrainingResult:
         folder = self.out / subfolder
         folder.mkdir(exist_ok=True)
-        return train(stage, settings, self.seed, folder, self.fingerprint, title)
+        return train(stage, settings, self.seed, folder, self.fingerprint, title, self.hardware)
 
     def train_affordance(
         self, stage: AffordanceStage, settings: AffordanceConfig, before: TrainingResult
@@ -196,12 +233,15 @@ def _train_oracle(
     runner: _Runner, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split
 ) -> OracleCritic:
     """Train the oracle critic, save it, and start AAP from it."""
-    with torch.random.fork_rng(devices=[]):
+    # Drawn on the CPU, so that the first weights are the same whatever device trains them.
+    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
         torch.manual_seed(torch_seed(config.seed, "learner.oracle") % 2**32)
         critic = OracleCritic(copy.deepcopy(policy.aap))
+    critic.to(runner.hardware.device)
     settings = config.aap.model_copy(update={"steps": config.aap.oracle_steps})
     runner.train(OracleStage(critic, dataset, parts, config.aap), settings, "oracle", ORACLE_FOLDER)
-    write_atomically(runner.out / ORACLE_FILE, save({n: t.contiguous() for n, t in critic.state_dict().items()}))
+    if sharing.rank() == 0:
+        write_atomically(runner.out / ORACLE_FILE, save({n: t.contiguous() for n, t in critic.state_dict().items()}))
     for inherited in ("encoder", "action_encoder", "critic_head"):
         getattr(policy.aap, inherited).load_state_dict(getattr(critic.aap, inherited).state_dict())
     return critic
@@ -213,6 +253,7 @@ def _fingerprint(job: StageJob, config: LearnerConfig, store: Store, policy: Pol
         "stage": job.stage,
         "config": config.model_dump(mode="json"),
         "store": store.digest(),
+        "newest_policy": job.newest_policy,
         "train": None if job.train_objects is None else sorted(job.train_objects),
         "validation": None if job.validation_objects is None else sorted(job.validation_objects),
     }
@@ -220,6 +261,18 @@ def _fingerprint(job: StageJob, config: LearnerConfig, store: Store, policy: Pol
     for _, data in sorted(policy.to_files().items()):
         digest.update(data)
     return digest.hexdigest()
+
+
+def _check_checkpoints(out: Path, fingerprint: str) -> None:
+    """Refuse a folder with checkpoints of another run before anything in it is touched.
+
+    Raises:
+        UsageError: a checkpoint is of a run with other data or settings.
+        StoreError: a checkpoint is damaged.
+    """
+    for path in (out / folder / CHECKPOINT_FILE for folder in CHECKPOINT_FOLDERS):
+        if path.exists():
+            check_fingerprint(read_cursor(path), fingerprint, out)
 
 
 def _check_done(path: Path, fingerprint: str) -> None:

@@ -15,9 +15,13 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
-from learner.checkpoint import Cursor, read_checkpoint, write_checkpoint
+from learner import sharing
+from learner.checkpoint import Cursor, check_fingerprint, read_checkpoint, read_cursor, write_checkpoint
 from learner.configuration import TrainingConfig
+from learner.events import EVENTS_FOLDER, EventFiles
+from learner.hardware import Hardware
 from learner.progress import ProgressReport, Standing
 from shared.errors import UsageError
 from shared.seeds import generator
@@ -75,7 +79,13 @@ class TrainingResult:
 
 
 def train(
-    stage: Stage, config: TrainingConfig, seed: int, out: Path, fingerprint: str = "", title: str = ""
+    stage: Stage,
+    config: TrainingConfig,
+    seed: int,
+    out: Path,
+    fingerprint: str = "",
+    title: str = "",
+    hardware: Hardware | None = None,
 ) -> TrainingResult:
     """Train a stage, from its last checkpoint in `out` where there is one.
 
@@ -86,19 +96,38 @@ def train(
         out: an existing folder for the checkpoint and the metrics.
         fingerprint: of everything that the result depends on; a checkpoint with another one is refused.
         title: what lines of progress call it; the stage's name where none is given.
+        hardware: what to train on, where the stage's module and data already are; the CPU where none is given.
 
     Raises:
         UsageError: the checkpoint is of another run, or the loss is not finite.
         StoreError: the checkpoint is damaged.
     """
-    return _Loop(stage, config, seed, out, fingerprint).run(title or stage.name)
+    return _Loop(stage, config, seed, out, fingerprint, hardware or Hardware()).run(title or stage.name)
+
+
+class _Losses(nn.Module):
+    """A stage's losses as a forward pass, which is what DistributedDataParallel watches."""
+
+    def __init__(self, stage: Stage) -> None:
+        super().__init__()
+        self.module = stage.module
+        self._loss = stage.loss
+
+    def forward(self, rng: np.random.Generator) -> tuple[dict[str, Tensor], int]:
+        """The losses of one batch, and how many interactions it has."""
+        result = self._loss(rng)
+        return dict(result.losses), result.interactions
 
 
 class _Loop:
     """The state of one training run."""
 
-    def __init__(self, stage: Stage, config: TrainingConfig, seed: int, out: Path, fingerprint: str) -> None:
-        self.stage, self.config, self.seed, self.out = stage, config, seed, out
+    def __init__(
+        self, stage: Stage, config: TrainingConfig, seed: int, out: Path, fingerprint: str, hardware: Hardware
+    ) -> None:
+        self.stage, self.config, self.seed, self.out, self.hardware = stage, config, seed, out, hardware
+        if config.seconds is not None and sharing.processes() > 1:
+            raise UsageError("'seconds' is for one process, since clocks differ; give 'steps' alone to several")
         self.groups = [group for group in stage.parameter_groups() if group.parameters]
         self.optimiser = torch.optim.Adam(
             [{"params": list(group.parameters)} for group in self.groups],
@@ -109,15 +138,27 @@ class _Loop:
         self.best = {name: tensor.clone() for name, tensor in stage.module.state_dict().items()}
         self._loss = math.nan
         self._resume()
+        # Nobody may write a checkpoint before everybody has read the last one.
+        sharing.wait_for_all()
+        losses = _Losses(stage)
+        # Where a stage leaves parts of its module as they are, these never get a gradient.
+        together = sharing.processes() > 1
+        self._forward: nn.Module = DistributedDataParallel(losses, find_unused_parameters=True) if together else losses
+        self._viewer = EventFiles(out / EVENTS_FOLDER, self.cursor.step) if sharing.rank() == 0 else None
         self._saved_at = time.monotonic()
 
     def run(self, title: str) -> TrainingResult:
         """Step until the steps, the seconds or the patience are used up."""
-        with ProgressReport(title, self.config.steps, self.config.seconds, self.cursor.step) as report:
+        speaks = sharing.rank() == 0
+        with ProgressReport(
+            title, self.config.steps, self.config.seconds, self.cursor.step, silent=not speaks
+        ) as report:
             while not self._finished():
                 self._step()
                 report.update(self._standing())
         report.finish(self._standing(), self.cursor.best_step)
+        if self._viewer is not None:
+            self._viewer.close()
         self.stage.module.load_state_dict(self.best)
         self.stage.module.eval()
         cursor = self.cursor
@@ -139,9 +180,11 @@ class _Loop:
         for group, options in zip(self.groups, self.optimiser.param_groups, strict=True):
             options["lr"] = decayed * group.rate
         self.stage.module.train()
-        result = self.stage.loss(generator(self.seed, f"learner.{self.stage.name}", step))
-        total = torch.stack(list(result.losses.values())).sum()
-        self._loss = total.item()
+        with self.hardware.products():
+            losses, interactions = self._forward(generator(self.seed, f"learner.{self.stage.name}", step))
+        total = torch.stack(list(losses.values())).sum()
+        values = sharing.averaged(torch.stack(list(losses.values()))).tolist()
+        self._loss = math.fsum(values)
         if not math.isfinite(self._loss):
             raise UsageError(f"{self.stage.name}: the loss is not finite at step {step}; lower learning_rate")
         self.optimiser.zero_grad(set_to_none=True)
@@ -150,13 +193,13 @@ class _Loop:
         self.cursor = self.cursor.model_copy(
             update={
                 "step": step + 1,
-                "interactions": self.cursor.interactions + result.interactions,
+                "interactions": self.cursor.interactions + interactions,
                 "seconds": self.cursor.seconds + time.monotonic() - started,
             }
         )
         ended = self._finished()
         if ended or self.cursor.step % self.config.validate_every == 0:
-            self._validate({name: float(loss.item()) for name, loss in result.losses.items()})
+            self._validate(dict(zip(losses, values, strict=True)))
         if ended or time.monotonic() - self._saved_at >= self.config.checkpoint_seconds:
             self._save()
 
@@ -182,24 +225,25 @@ class _Loop:
             "validation_seconds": round(time.monotonic() - started, 3),
             "interactions_per_second": round(self.cursor.interactions / max(self.cursor.seconds, 1e-9), 1),
         }
-        with (self.out / METRICS_FILE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(without_nan(line)) + "\n")
+        if self._viewer is not None:
+            with (self.out / METRICS_FILE).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(without_nan(line)) + "\n")
+            self._viewer.add(self.cursor.step, without_nan(line))
 
     def _save(self) -> None:
+        if sharing.rank() > 0:
+            return
         path = self.out / CHECKPOINT_FILE
         write_checkpoint(path, self.cursor, self.stage.module, self.best, self.optimiser)
         self._saved_at = time.monotonic()
 
     def _resume(self) -> None:
         path = self.out / CHECKPOINT_FILE
-        if not path.exists():
-            self._forget_metrics_after(0)
-            return
-        cursor, self.best = read_checkpoint(path, self.stage.module, self.optimiser)
-        if cursor.fingerprint != self.cursor.fingerprint:
-            raise UsageError(f"{self.out}: holds a run with other data or settings; choose another --out")
-        self.cursor = cursor
-        self._forget_metrics_after(cursor.step)
+        if path.exists():
+            check_fingerprint(read_cursor(path), self.cursor.fingerprint, self.out)
+            self.cursor, self.best = read_checkpoint(path, self.stage.module, self.optimiser)
+        if sharing.rank() == 0:
+            self._forget_metrics_after(self.cursor.step)
 
     def _forget_metrics_after(self, step: int) -> None:
         """Drop lines written after the checkpoint, which will be written again, and a line that a kill cut off."""

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from learner.__main__ import main
+from cluster.cli import run
 from learner.aap import AapStage, OracleStage, predict
 from learner.affordance import AapAnswer, AffordanceStage, AipAnswer, Answer, PriorAnswer
 from learner.aip import AipStage
@@ -350,7 +350,7 @@ def test_a_checkpoint_of_another_run_is_refused(trained: Path, tmp_path: Path) -
     shutil.copytree(trained / "prior", tmp_path / "out")
     (tmp_path / "out" / DONE_FILE).unlink()
     (tmp_path / "out" / "checkpoint.safetensors").write_bytes(b"not one")
-    assert main(["prior", "--store", str(trained / "store"), "--out", str(tmp_path / "out")]) == 2
+    assert run(["train", "prior", "--store", str(trained / "store"), "--out", str(tmp_path / "out")]) == 2
 
 
 @pytest.mark.parametrize(
@@ -374,7 +374,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     places = {"STORE": str(trained / "store"), "PRIOR": str(trained / "prior")}
-    assert main([places.get(argument, argument) for argument in arguments]) == 2
+    assert run(["train", *[places.get(argument, argument) for argument in arguments]]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -383,7 +383,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
 def test_a_misspelt_setting_is_named(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "c.toml").write_text("[prior]\nlearning_rat = 1.0\n")
     arguments = ["prior", "--store", str(trained / "store"), "--out", str(tmp_path / "x")]
-    assert main([*arguments, "--config", str(tmp_path / "c.toml")]) == 2
+    assert run(["train", *arguments, "--config", str(tmp_path / "c.toml")]) == 2
     assert "did you mean 'learning_rate'" in capsys.readouterr().err
 
 
