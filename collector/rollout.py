@@ -1,28 +1,23 @@
 """Rollouts: one object, one draw of hidden dynamics, one camera, and a sequence of interactions."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from collector.articulation import ArticulatedObject
 from collector.clock import StageClock
 from collector.draws import Draw, draw_rollout
 from collector.environment import SapienEnvironment
-from collector.evaluation import evaluate
+from collector.evaluation import ProposerFactory, evaluate
 from collector.proposers import RandomProposer
 from collector.recorder import Recorder, try_from_one_state, try_repeatedly
 from shared import seeds
 from shared.geometry import camera_pose
 from shared.plan import Plan
-from shared.records import RolloutRecord
+from shared.records import RolloutRecord, RolloutStatus
 from shared.tasks import task_named
-from shared.vocabulary import Order, Proposer, Role
+from shared.vocabulary import Order, Role
 
 TRIES = 8
 """Draws of a camera and a state before a rollout is given up as showing nothing that could be acted upon."""
-
-ProposerFactory = Callable[[str, np.random.Generator], Proposer]
-"""Makes the proposer of a name, such as "aip", with its own randomness."""
 
 
 def run_rollout(
@@ -48,8 +43,13 @@ def run_rollout(
             evaluate(plan, index, recorder, make_proposer, clock)
         else:
             collect(plan, index, recorder, states, make_proposer, clock)
-        return _record(plan, draw, "ok", recorder)
-    return _record(plan, draw, "nothing-to-act-on", None)
+        return _record(plan, draw, RolloutStatus.OK, recorder)
+    return _record(plan, draw, RolloutStatus.NOTHING_TO_ACT_ON, None)
+
+
+def quarantined_rollout(plan: Plan, index: int) -> RolloutRecord:
+    """The record of a rollout that is not executed, since that failed again and again: what was drawn, and no more."""
+    return _record(plan, draw_rollout(plan, index), RolloutStatus.QUARANTINED, None)
 
 
 def make_environment(
@@ -88,7 +88,9 @@ def collect(
         first = environment.state()
         rng = seeds.generator(plan.setting.seed, f"policy/{plan.key}", index)
         most = min(rollout.context, rollout.interactions)
-        try_repeatedly(recorder, make_proposer(plan.proposer, rng), most, Role.COLLECT, [], "", clock)
+        try_repeatedly(
+            recorder, make_proposer(plan.proposer, rng, plan.policy_version), most, Role.COLLECT, [], "", clock
+        )
         if recorder.sound:
             environment.restore(first)
     elif rollout.order is Order.CONTINUE:
@@ -108,7 +110,7 @@ def _next_state(environment: SapienEnvironment, states: np.random.Generator) -> 
     return any(environment.reset(states) and environment.shows_a_target() for _ in range(TRIES))
 
 
-def _record(plan: Plan, draw: Draw, status: str, recorder: Recorder | None) -> RolloutRecord:
+def _record(plan: Plan, draw: Draw, status: RolloutStatus, recorder: Recorder | None) -> RolloutRecord:
     return RolloutRecord(
         index=draw.index,
         plan_key=plan.key,

@@ -22,7 +22,8 @@ from pathlib import Path
 from shared.errors import StoreError, UsageError
 
 TEMPORARY_PREFIX = ".tmp-"
-_TEMPORARY_NAME = re.compile(r"\.tmp-[^~]*~(?P<space>[^~]*)~(?P<pid>\d{1,10})~(?P<start>\d{1,20})~[0-9a-f]+")
+_PROCESS_NAME = re.compile(r"(?P<space>[^~/]*)~(?P<pid>\d{1,10})~(?P<start>\d{1,20})")
+_TEMPORARY_NAME = re.compile(r"\.tmp-[^~]*~(?P<process>[^~]*~\d+~\d+)~[0-9a-f]+")
 _LOCK_POLL_S = 0.01
 
 
@@ -165,10 +166,23 @@ def _process_space() -> str:
     return f"{host_name()}-{namespace}"
 
 
+def process_name() -> str:
+    """This process, as no other is called, on any host: what its files can be named by."""
+    process = os.getpid()
+    return f"{_process_space()}~{process}~{_start_ticks(process)}"
+
+
+def is_gone(process: str) -> bool:
+    """Whether the process of this `process_name` has ended for certain; one on another host may be alive."""
+    match = _PROCESS_NAME.fullmatch(process)
+    if match is None or match["space"] != _process_space():
+        return False
+    return not _is_running(int(match["pid"]), int(match["start"]))
+
+
 def temporary_name(name: str) -> str:
     """A unique name for a temporary file or folder that will become `name`, and that says who made it."""
-    process = os.getpid()
-    return f"{TEMPORARY_PREFIX}{name}~{_process_space()}~{process}~{_start_ticks(process)}~{secrets.token_hex(6)}"
+    return f"{TEMPORARY_PREFIX}{name}~{process_name()}~{secrets.token_hex(6)}"
 
 
 def remove_if_abandoned(path: Path) -> bool:
@@ -180,7 +194,7 @@ def remove_if_abandoned(path: Path) -> bool:
         Whether it was removed.
     """
     match = _TEMPORARY_NAME.fullmatch(path.name)
-    if match is None or match["space"] != _process_space() or _is_running(int(match["pid"]), int(match["start"])):
+    if match is None or not is_gone(match["process"]):
         return False
     remove_tree(path)
     return True

@@ -1,6 +1,7 @@
 """Records: an executed rollout as the collector hands it to the store, with all that a replay needs."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 from shared.plan import ObjectRef
 from shared.vocabulary import Action, Float, HiddenDynamics, Observation, Order, Outcome, Primitive, Role
@@ -58,6 +59,16 @@ class InteractionRecord:
     seconds: float
 
 
+class RolloutStatus(StrEnum):
+    """Whether a rollout was executed, and if not, why."""
+
+    OK = "ok"
+    NOTHING_TO_ACT_ON = "nothing-to-act-on"
+    """No draw of a camera and a state came to rest and showed a part that the task may act on."""
+    QUARANTINED = "quarantined"
+    """Its execution crashed, hung or failed again and again; the shard's manifest says how. Never a label."""
+
+
 @dataclass(frozen=True, slots=True)
 class RolloutRecord:
     """One object, one draw of hidden dynamics, one camera, and a sequence of interactions.
@@ -71,7 +82,7 @@ class RolloutRecord:
         elevation_deg: of the camera.
         seed: the plan's seed, from which all of the rollout was drawn.
         fidelity: name of the fidelity preset.
-        status: "ok", or why there are no interactions ("no-visible-part", "not-settled", "abandoned").
+        status: whether it was executed; there are neither observations nor interactions if not.
         observations: each one once, however many actions were tried from it.
         interactions: in the order they were executed.
     """
@@ -84,6 +95,6 @@ class RolloutRecord:
     elevation_deg: float
     seed: int
     fidelity: str
-    status: str
+    status: RolloutStatus
     observations: tuple[Observation, ...]
     interactions: tuple[InteractionRecord, ...]

@@ -15,7 +15,7 @@ from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
 from shared.geometry import camera_pose, gripper_rotation
 from shared.observation import round_normals, round_points
 from shared.plan import Job, ObjectRef, Plan, Setting
-from shared.records import InteractionRecord, RolloutRecord
+from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.vocabulary import (
     Action,
     Direction,
@@ -68,7 +68,7 @@ def fabricate_rollout(plan: Plan, index: int, interactions: int = 8, per_observa
         elevation_deg=elevation,
         seed=setting.seed,
         fidelity=setting.collection.fidelity.name,
-        status="ok" if interactions else "no-visible-part",
+        status=RolloutStatus.OK if interactions else RolloutStatus.NOTHING_TO_ACT_ON,
         observations=observations,
         interactions=tuple(
             fabricate_interaction(

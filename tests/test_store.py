@@ -57,7 +57,7 @@ def test_rollouts_without_any_interaction_are_kept(tmp_path: Path) -> None:
     manifest = store.commit(PLAN, Job(PLAN.key, 0, 2), rollouts, {})
     assert identical(store.read_rollouts(manifest.shard_id), tuple(rollouts))
     assert len(store.read_observations(manifest.shard_id)) == 0
-    assert store.rollouts().column("status").to_pylist() == ["no-visible-part"] * 2
+    assert store.rollouts().column("status").to_pylist() == ["nothing-to-act-on"] * 2
     assert len(store.interactions()) == 0
     assert verify(store) == []
 
@@ -403,7 +403,7 @@ def test_info_counts_what_is_there(tmp_path: Path) -> None:
     assert list(figures.by_role) == ["collect"]
     assert figures.by_outcome["abandoned"] == 1
     assert sum(figures.by_outcome.values()) == 8
-    assert figures.by_status == {"no-visible-part": 1, "ok": 1}
+    assert figures.by_status == {"nothing-to-act-on": 1, "ok": 1}
     on_disk = sum(path.stat().st_size for path in store.path.glob("shards/*/**/*") if path.is_file())
     assert figures.bytes == on_disk
 

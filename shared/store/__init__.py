@@ -1,20 +1,24 @@
 """The store: immutable shards, each complete if and only if its manifest is there."""
 
 from shared.store.info import StoreInfo, Tally, info
-from shared.store.layout import SCHEMA_VERSION, FileEntry, ShardManifest
+from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
 from shared.store.observations import ObservationArrays
 from shared.store.store import Store
+from shared.store.underway import Crumb, Underway
 from shared.store.verify import Problem, verify
 
 __all__ = [
     "SCHEMA_VERSION",
+    "Crumb",
     "FileEntry",
     "ObservationArrays",
     "Problem",
+    "Quarantined",
     "ShardManifest",
     "Store",
     "StoreInfo",
     "Tally",
+    "Underway",
     "info",
     "verify",
 ]

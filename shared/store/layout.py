@@ -9,6 +9,7 @@
         observations.zarr/           the clouds
         manifest.json                counts, checksums, content digests, provenance; written last
       policies/<version>/            whatever the learner publishes, and index.json
+      underway/                      breadcrumbs of live workers (`shared.store.underway`); no data
 
 Names that begin with ".tmp-" are work in progress or its remnants; names that begin with ".lock-" are locks.
 """
@@ -32,6 +33,7 @@ OBSERVATIONS_FOLDER = "observations.zarr"
 PLANS_FOLDER = "plans"
 SHARDS_FOLDER = "shards"
 POLICIES_FOLDER = "policies"
+UNDERWAY_FOLDER = "underway"
 LOCK_PREFIX = ".lock-"
 
 MAX_DOCUMENT_BYTES = 64 << 20
@@ -41,6 +43,9 @@ MAX_POINTS = 1 << 14
 MAX_ALL_POINTS = 1 << 25
 """Bounds of one shard: rollouts, interactions and observations; N; and points of all clouds. A hostile manifest
 cannot ask for unbounded work."""
+
+MAX_REASON = 500
+"""Characters."""
 
 _SHA256 = r"^[0-9a-f]{64}$"
 PLAN_KEY = r"[a-z][a-z0-9-]{0,30}-v[0-9]{1,9}"
@@ -52,6 +57,16 @@ class FileEntry(StrictModel):
 
     size: int = Field(ge=0)
     sha256: str = Field(pattern=_SHA256)
+
+
+class Quarantined(StrictModel):
+    """A rollout that was given up, since its execution failed again and again."""
+
+    rollout: int = Field(ge=0)
+    reason: str = Field(max_length=MAX_REASON)
+    """One line."""
+    command: str = Field(max_length=4096)
+    """What executes it alone, in the foreground."""
 
 
 class ShardManifest(StrictModel):
@@ -71,6 +86,8 @@ class ShardManifest(StrictModel):
     """Content digest of each rollout, from `start` on."""
     software: dict[str, str]
     provenance: dict[str, str]
+    quarantined: tuple[Quarantined, ...] = Field((), max_length=MAX_ROWS)
+    """Why rollouts of that status are; like provenance, not part of the content digests."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "ShardManifest":
@@ -80,6 +97,8 @@ class ShardManifest(StrictModel):
             raise ValueError("a digest is not a SHA-256")
         if self.observations * self.points > MAX_ALL_POINTS:
             raise ValueError(f"{self.observations} clouds of {self.points} points; allowed: {MAX_ALL_POINTS} points")
+        if not all(self.start <= each.rollout < self.stop for each in self.quarantined):
+            raise ValueError("a rollout of another shard is quarantined")
         return self
 
     @property

@@ -11,7 +11,7 @@ import numpy as np
 from shared.errors import StoreError
 from shared.files import read_bounded
 from shared.plan import Job, ObjectRef
-from shared.records import InteractionRecord, RolloutRecord
+from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store import observations
 from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS
 from shared.store.layout import (
@@ -174,7 +174,7 @@ def _rollout(
         elevation_deg=float(head["elevation_deg"]),
         seed=int(head["seed"]),
         fidelity=head["fidelity"],
-        status=head["status"],
+        status=RolloutStatus(head["status"]),
         observations=observations,
         interactions=tuple(_interaction(row) for row in rows),
     )

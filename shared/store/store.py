@@ -29,6 +29,8 @@ from shared.store.layout import (
     POLICIES_FOLDER,
     SHARDS_FOLDER,
     STORE_FILE,
+    UNDERWAY_FOLDER,
+    Quarantined,
     ShardManifest,
     StoreDocument,
     parse_shard_id,
@@ -38,6 +40,7 @@ from shared.store.observations import ObservationArrays
 from shared.store.provenance import software_versions
 from shared.store.sealed import seal, unseal
 from shared.store.tables import INTERACTION_SCHEMA, ROLLOUT_SCHEMA
+from shared.store.underway import Underway
 from shared.store.writer import commit_shard
 
 MAX_SEED = 2**64 - 1
@@ -144,8 +147,17 @@ class Store:
         """
         return [reader.read_manifest(shard) for shard in reader.committed_shards(self.shards_folder, plan_key)]
 
+    def holds(self, job: Job) -> bool:
+        """Whether the shard of a job is committed."""
+        return reader.is_committed(self.shards_folder / job.shard_id)
+
     def commit(
-        self, plan: Plan, job: Job, rollouts: Sequence[RolloutRecord], provenance: Mapping[str, str]
+        self,
+        plan: Plan,
+        job: Job,
+        rollouts: Sequence[RolloutRecord],
+        provenance: Mapping[str, str],
+        quarantined: Sequence[Quarantined] = (),
     ) -> ShardManifest:
         """Store the rollouts of a job as one shard: wholly or not at all, and once, however many workers try.
 
@@ -154,6 +166,7 @@ class Store:
             job: the range of rollouts.
             rollouts: all of them, in order.
             provenance: what is known of how they were made, such as seconds by stage; not part of the digest.
+            quarantined: why rollouts of that status are; likewise no part of it.
 
         Returns:
             The manifest; that of the shard which was there already, where another worker was faster.
@@ -172,13 +185,13 @@ class Store:
                     "is of another object or seed than the store's"
                 )
         points = self.setting.collection.camera.points
-        return commit_shard(self.shards_folder, job, rollouts, points, provenance)
+        return commit_shard(self.shards_folder, job, rollouts, points, provenance, quarantined)
 
     def sweep(self) -> int:
         """Remove what dead writers left unfinished; returns how many files and folders that was."""
         folders = [self.path, self._plans, self.shards_folder, self.policies_folder]
         remnants = [p for folder in folders if folder.is_dir() for p in folder.glob(f"{TEMPORARY_PREFIX}*")]
-        return sum(remove_if_abandoned(remnant) for remnant in remnants)
+        return sum(remove_if_abandoned(remnant) for remnant in remnants) + self.underway.sweep()
 
     def digest(self, plan_key: str | None = None) -> str:
         """Content digest of the store, or of one plan: independent of shards, workers, hosts and times."""
@@ -261,6 +274,11 @@ class Store:
     def policies_folder(self) -> Path:
         """Where policies lie."""
         return self.path / POLICIES_FOLDER
+
+    @property
+    def underway(self) -> Underway:
+        """Where workers leave their breadcrumbs."""
+        return Underway(self.path / UNDERWAY_FOLDER)
 
     @property
     def _plans(self) -> Path:

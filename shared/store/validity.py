@@ -7,7 +7,7 @@ import numpy as np
 
 from shared.errors import StoreError
 from shared.plan import Job
-from shared.records import InteractionRecord, RolloutRecord
+from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store.layout import MAX_ALL_POINTS, MAX_ROWS
 from shared.store.observations import check_observation
 from shared.vocabulary import Float
@@ -51,6 +51,8 @@ def _check_rollout(rollout: RolloutRecord, points: int) -> None:
     _check_finite("rollout's numbers", _rollout_numbers(rollout))
     for observation in rollout.observations:
         check_observation(observation, points)
+    if rollout.status is not RolloutStatus.OK and (rollout.interactions or rollout.observations):
+        raise ValueError(f"is '{rollout.status}', so it cannot hold what it saw or did")
     steps = [interaction.step for interaction in rollout.interactions]
     if sorted(set(steps)) != steps or (steps and steps[0] < 0):
         raise ValueError(f"steps must grow, given {str(steps)[:80]}")

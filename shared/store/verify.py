@@ -20,6 +20,7 @@ from shared.store.layout import (
     POLICIES_FOLDER,
     SHARDS_FOLDER,
     STORE_FILE,
+    UNDERWAY_FOLDER,
     ShardManifest,
     parse_shard_id,
 )
@@ -133,7 +134,7 @@ def _plans_and_policies(store: Store) -> Iterator[Problem]:
 
 def _strangers(store: Store) -> Iterator[Problem]:
     """Files and folders that the store did not make, and shards that were never committed."""
-    ours = {STORE_FILE, PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER}
+    ours = {STORE_FILE, PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER, UNDERWAY_FOLDER}
     passing = (TEMPORARY_PREFIX, LOCK_PREFIX)
     for entry in sorted(store.path.iterdir()):
         if entry.name not in ours and not entry.name.startswith(passing):

@@ -18,6 +18,7 @@ from shared.store.layout import (
     OBSERVATIONS_FOLDER,
     ROLLOUTS_FILE,
     FileEntry,
+    Quarantined,
     ShardManifest,
     parse_shard_id,
 )
@@ -32,7 +33,12 @@ _LOCK_WAIT_S = 60.0
 
 
 def commit_shard(
-    shards: Path, job: Job, rollouts: Sequence[RolloutRecord], points: int, provenance: Mapping[str, str]
+    shards: Path,
+    job: Job,
+    rollouts: Sequence[RolloutRecord],
+    points: int,
+    provenance: Mapping[str, str],
+    quarantined: Sequence[Quarantined],
 ) -> ShardManifest:
     """Write a shard and commit it; where another worker was faster, its shard stays and its manifest is returned.
 
@@ -42,6 +48,7 @@ def commit_shard(
         rollouts: in order.
         points: N, of every cloud.
         provenance: what else is known of how they were made, such as seconds by stage.
+        quarantined: why rollouts of that status are.
 
     Raises:
         StoreError: a rollout breaks the rules of a record, or the job overlaps another shard of its plan.
@@ -51,7 +58,7 @@ def commit_shard(
         return read_manifest(final)
     check_rollouts(rollouts, job, points, job.shard_id)
     files = _encode(rollouts, points)
-    manifest = _describe(job, rollouts, files, points, provenance)
+    manifest = _describe(job, rollouts, files, points, provenance, quarantined)
     shards.mkdir(exist_ok=True)
     temporary = shards / temporary_name(job.shard_id)
     try:
@@ -83,6 +90,7 @@ def _describe(
     files: Mapping[str, bytes],
     points: int,
     provenance: Mapping[str, str],
+    quarantined: Sequence[Quarantined],
 ) -> ShardManifest:
     return ShardManifest(
         plan_key=job.plan_key,
@@ -95,6 +103,7 @@ def _describe(
         digests=tuple(rollout_digest(rollout) for rollout in rollouts),
         software=software_versions(),
         provenance=process_provenance() | {name: str(value) for name, value in provenance.items()},
+        quarantined=tuple(quarantined),
     )
 
 

@@ -1,0 +1,122 @@
+"""What is under way: a breadcrumb of each worker's rollout, and the last words of workers that crashed.
+
+    STORE/underway/<process>.json    the rollout that this process executes at this moment
+    STORE/underway/<process>.fault   where it was when it crashed or hung; empty as long as all is well
+
+They lie in the store since that is all that workers and driver are sure to share. A file is named by the process that
+wrote it, so that none is ever taken for another's, however many have tried the same rollout. Nothing here is forced to
+the disk: a breadcrumb matters after the end of a process, not of a machine.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from pydantic import Field, ValidationError
+
+from shared.configuration import StrictModel
+from shared.errors import StoreError
+from shared.files import is_gone, process_name, read_bounded
+
+_CRUMB, _FAULT = ".json", ".fault"
+_MAX_BYTES = 1 << 16
+_FRAMES = 2
+"""Frames of a traceback that a reason names, from the innermost outwards."""
+_FRAME = re.compile(r'  File "(?P<file>[^"]*)", line (?P<line>\d+) in (?P<function>.*)')
+_TIMEOUT = re.compile(r"Timeout \((?P<limit>[\d:.]+)\)!")
+
+
+class Crumb(StrictModel):
+    """What a process is doing."""
+
+    shard_id: str = Field(max_length=100)
+    """Of the job."""
+    rollout: int | None = Field(ge=0)
+    """The one under way; None before the first and after the last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Underway:
+    """The folder of breadcrumbs of one store.
+
+    Example:
+        underway.leave(Crumb(shard_id=job.shard_id, rollout=17))    # the worker's process
+        underway.crumb_of(process), underway.fault_of(process)      # the driver, once that process has ended
+    """
+
+    folder: Path
+
+    def leave(self, crumb: Crumb) -> None:
+        """Say what this process does now.
+
+        Raises:
+            OSError: the file cannot be written; no older one is then left that would blame the wrong rollout.
+        """
+        file = self._file(process_name(), _CRUMB)
+        try:
+            file.write_bytes(crumb.model_dump_json().encode())
+        except FileNotFoundError:
+            self.folder.mkdir(exist_ok=True)
+            file.write_bytes(crumb.model_dump_json().encode())
+        except OSError:
+            file.unlink(missing_ok=True)
+            raise
+
+    def clear(self) -> None:
+        """Say that this process does nothing."""
+        self._file(process_name(), _CRUMB).unlink(missing_ok=True)
+
+    def open_fault_log(self) -> IO[bytes]:
+        """A file for the last words of this process, as `faulthandler` writes them."""
+        self.folder.mkdir(exist_ok=True)
+        return self._file(process_name(), _FAULT).open("wb", buffering=0)
+
+    def crumb_of(self, process: str) -> Crumb | None:
+        """What a process does, or did when it ended; None if it left no breadcrumb, or half of one."""
+        try:
+            return Crumb.model_validate_json(self._read(process, _CRUMB))
+        except ValidationError:
+            return None
+
+    def fault_of(self, process: str) -> str:
+        """Of what a process died, in one line; "" if nothing within it brought it about."""
+        return summary_of(self._read(process, _FAULT).decode(errors="replace"))
+
+    def forget(self, process: str) -> None:
+        """Remove what a process left."""
+        for suffix in (_CRUMB, _FAULT):
+            self._file(process, suffix).unlink(missing_ok=True)
+
+    def sweep(self) -> int:
+        """Remove what ended processes of this host left; returns how many files that was."""
+        if not self.folder.is_dir():
+            return 0
+        abandoned = [file for file in self.folder.iterdir() if is_gone(file.stem)]
+        for file in abandoned:
+            file.unlink(missing_ok=True)
+        return len(abandoned)
+
+    def _file(self, process: str, suffix: str) -> Path:
+        # Not `with_suffix`: a host's name may hold dots.
+        return self.folder / f"{process}{suffix}"
+
+    def _read(self, process: str, suffix: str) -> bytes:
+        try:
+            return read_bounded(self._file(process, suffix), _MAX_BYTES)
+        except StoreError:
+            return b""
+
+
+def summary_of(words: str) -> str:
+    """What `faulthandler` wrote, in one line of bounded length: what happened, and the innermost frames."""
+    if not words.strip():
+        return ""
+    first = " ".join(words.strip().splitlines()[0].split())[:200]
+    timeout = _TIMEOUT.fullmatch(first)
+    what = f"took more than {timeout['limit']}" if timeout else first.removeprefix("Fatal Python error: ")
+    # After a timeout every thread has a section; the main thread's, which executes jobs, comes last.
+    section = words.rpartition("(most recent call first):")[2]
+    frames = [match for line in section.splitlines() if (match := _FRAME.fullmatch(line))][:_FRAMES]
+    places = [f"{frame['function'][:60]} ({Path(frame['file']).name[:60]}:{frame['line']})" for frame in frames]
+    return f"{what}, in {' of '.join(places)}" if places else what
