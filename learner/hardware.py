@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor, distributed
@@ -12,9 +12,6 @@ from torch import Tensor, distributed
 from learner import sharing
 from learner.configuration import LearnerConfig
 from shared.errors import UsageError
-
-Moved = TypeVar("Moved")
-
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
@@ -95,12 +92,12 @@ def choose_device(name: str, number: int = 0) -> torch.device:
     return torch.device(kind)
 
 
-def moved(value: Moved, device: torch.device) -> Moved:
+def moved(value: Any, device: torch.device) -> Any:
     """A data class with all its tensors, those of nested data classes and tuples of tensors included, on a device."""
     if isinstance(value, Tensor):
         return value.to(device)
     if isinstance(value, tuple) and value and isinstance(value[0], Tensor):
-        return type(value)(moved(entry, device) for entry in value)
+        return tuple(entry.to(device) for entry in value)
     if is_dataclass(value) and not isinstance(value, type):
         return replace(value, **{field.name: moved(getattr(value, field.name), device) for field in fields(value)})
     return value

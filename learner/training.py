@@ -149,10 +149,8 @@ class _Loop:
 
     def run(self, title: str) -> TrainingResult:
         """Step until the steps, the seconds or the patience are used up."""
-        speaks = sharing.rank() == 0
-        with ProgressReport(
-            title, self.config.steps, self.config.seconds, self.cursor.step, silent=not speaks
-        ) as report:
+        config, silent = self.config, sharing.rank() > 0
+        with ProgressReport(title, config.steps, config.seconds, self.cursor.step, silent=silent) as report:
             while not self._finished():
                 self._step()
                 report.update(self._standing())
