@@ -11,9 +11,10 @@ A robot's author implements `Environment` over a camera and an arm, and lets the
 
 from importlib.metadata import version
 
-from shared.adaptation import Adapter, AipProposer, ExploitProposer
+from shared.adaptation import Adapter
 from shared.errors import AdaAffordError
 from shared.policy import Policy
+from shared.proposers import AipProposer, ExploitProposer
 from shared.store import Store
 from shared.vocabulary import (
     Action,

@@ -5,7 +5,6 @@ affordance chooses is executed from where the tries left the object (as in the p
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,42 +12,19 @@ from collector.clock import StageClock
 from collector.proposers import RandomProposer
 from collector.recorder import Recorder, try_from_one_state, try_repeatedly
 from shared import seeds
-from shared.errors import UsageError
+from shared.methods import method_named
 from shared.plan import Plan
 from shared.vocabulary import Interaction, Order, Proposer, Role
 
-
-@dataclass(frozen=True, slots=True)
-class Method:
-    """Who fills the set of interactions, and who chooses the action that is judged."""
-
-    tries: str | None
-    exploits: str
-
-
-METHODS = {
-    "where2act": Method(None, "where2act"),
-    "ours-random": Method("random", "aap"),
-    "ours-final": Method("aip", "aap"),
-}
-
-
-def method_named(name: str) -> Method:
-    """The method called `name`.
-
-    Raises:
-        UsageError: there is no such method; the message lists those there are.
-    """
-    if name not in METHODS:
-        raise UsageError(f"unknown method '{name}'; allowed: {', '.join(METHODS)}")
-    return METHODS[name]
+ProposerFactory = Callable[[str, np.random.Generator, int], Proposer]
+"""Makes the proposer of a name, such as "aip", with its own randomness, of a policy version."""
 
 
 def evaluate(
     plan: Plan,
     index: int,
     recorder: Recorder,
-    make_proposer: Callable[[str, np.random.Generator], Proposer],
+    make_proposer: ProposerFactory,
     clock: StageClock,
 ) -> None:
     """Run every method of the plan on the environment's present state.
@@ -57,7 +33,7 @@ def evaluate(
         plan: an evaluation plan.
         index: number of the rollout.
         recorder: of the environment, in its start state.
-        make_proposer: makes "aip", "aap" and "where2act".
+        make_proposer: makes the proposers that the methods name.
         clock: sums wall time by stage.
     """
     config = plan.setting.evaluation
@@ -75,13 +51,14 @@ def evaluate(
             return
         environment.restore(start)
         method = method_named(name)
-        exploiter = make_proposer(method.exploits, rng(f"exploit/{name}"))
+        recorder.policy_version = version = method.policy_version(plan.policy_version)
+        exploiter = make_proposer(method.critic, rng(f"exploit/{name}"), version)
         context: Proposer | None = None
         if method.tries == RandomProposer.name:
             context = RandomProposer(rng(f"context/{name}"), edge_share)
         elif method.tries is not None:
-            context = make_proposer(method.tries, rng(f"context/{name}"))
-        _adapt(recorder, name, context, exploiter, sorted(config.budgets), clock)
+            context = make_proposer(method.tries, rng(f"context/{name}"), version)
+        _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), clock)
 
 
 def _adapt(

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,17 @@ from collector.clock import StageClock
 from collector.draws import object_of
 from collector.proposers import RandomProposer
 from collector.rollout import run_rollout
-from shared.adaptation import Adapter, AipProposer, ExploitProposer
-from shared.errors import WorkerError
+from shared.adaptation import Adapter
 from shared.plan import Job, Plan
 from shared.policy import Policy
+from shared.proposers import proposer_named
 from shared.records import RolloutRecord
 from shared.store import Store
 from shared.vocabulary import Proposer
 
 CACHED_OBJECTS = 16
+CACHED_POLICIES = 2
+"""An evaluation may go back and forth between the last policy and the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,11 +63,13 @@ class Worker:
         self._store = Store.open(Path(store))
         self._folder = objects
         self._objects: dict[str, ArticulatedObject] = {}
-        self._adapter: tuple[int, Adapter] | None = None
+        self._adapters: dict[int, Adapter] = {}
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """Take up the weights of a policy version."""
-        self._adapter = version, Adapter(Policy.from_files(files))
+        while len(self._adapters) >= CACHED_POLICIES:
+            self._adapters.pop(next(iter(self._adapters)))
+        self._adapters[version] = Adapter(Policy.from_files(files))
 
     def run(self, plan: Plan, job: Job) -> Receipt:
         """Execute a job's rollouts and commit its shard; the same job again gives the same shard."""
@@ -73,7 +78,7 @@ class Worker:
         records = []
         for index in range(job.start, job.stop):
             target = self._load(plan, index, clock)
-            records.append(run_rollout(plan, index, target, lambda name, rng: self._proposer(plan, name, rng), clock))
+            records.append(run_rollout(plan, index, target, partial(self._proposer, plan), clock))
         provenance = {"host": platform.node(), "pid": str(os.getpid())}
         with clock.stage("write"):
             manifest = self._store.commit(plan, job, records, provenance)
@@ -90,20 +95,13 @@ class Worker:
                 self._objects[ref.id] = load_ref(self._folder, ref, plan.setting.collection.collision)
         return self._objects[ref.id]
 
-    def _proposer(self, plan: Plan, name: str, rng: np.random.Generator) -> Proposer:
-        """The proposer called `name`, of the plan's policy."""
+    def _proposer(self, plan: Plan, name: str, rng: np.random.Generator, version: int) -> Proposer:
+        """The proposer called `name`, of a policy version."""
         if name == RandomProposer.name:
             return RandomProposer(rng)
-        if self._adapter is None or self._adapter[0] != plan.policy_version:
-            self.load_policy(plan.policy_version, self._store.read_policy(plan.policy_version))
-        assert self._adapter is not None
-        adapter = self._adapter[1]
-        match name:
-            case "aip":
-                return AipProposer(adapter, rng, plan.most_tries)
-            case "aap" | "where2act":
-                return ExploitProposer(adapter, rng, name)
-        raise WorkerError(f"no proposer is called '{name}'")
+        if version not in self._adapters:
+            self.load_policy(version, self._store.read_policy(version))
+        return proposer_named(name, self._adapters[version], rng, plan.most_tries)
 
 
 def _receipt(shard_id: str, records: list[RolloutRecord], seconds: dict[str, float]) -> Receipt:

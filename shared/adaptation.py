@@ -1,4 +1,4 @@
-"""The test-time procedure: what a history of tries says about an object, and what to try next.
+"""Test time: what a history of tries says about an object (`shared.proposers` says what to try next).
 
 Everything here runs on the CPU in a few milliseconds a step, needs nothing but a policy, and depends on its random
 generator alone.
@@ -19,6 +19,7 @@ from torch import Tensor
 from shared.errors import UsageError
 from shared.geometry import gripper_rotation, points_in_view, view_from_world
 from shared.grouping import group_cloud
+from shared.networks.aap import Aap
 from shared.networks.actions import middle_of
 from shared.networks.pointnet2 import CloudBatch, EncodedClouds, PointNet2
 from shared.policy import Policy
@@ -26,12 +27,11 @@ from shared.vocabulary import Action, Float, Float32, Interaction, Observation
 
 PROPOSALS = 100
 """Actions sampled at a point (AdaAfford, Next-step Interaction Action Proposal)."""
-TOP_POINTS = 100
-"""Points that an exploit is drawn from (AdaAfford, Evaluation Metrics)."""
-STOP_THRESHOLD = 0.0
-"""The paper says "e.g., 0.05", but the AIP score is a drop of a loss whose mean here is about 0.003, so that 0.05 would
-stop at once; 0 stops where no point promises any gain."""
 MAX_CACHED_OBSERVATIONS = 64
+
+AdaptiveName = Literal["aap", "where2act-interaction"]
+"""Modules that encode a history into z, and score under it."""
+EncoderName = Literal["prior", "aip", AdaptiveName]
 
 
 @dataclass(slots=True)
@@ -74,7 +74,7 @@ class Adapter:
         policy.modules().eval()
         self._entries: OrderedDict[int, _Entry] = OrderedDict()
 
-    def encode(self, observation: Observation, module: Literal["prior", "aap", "aip"] = "aap") -> EncodedClouds:
+    def encode(self, observation: Observation, module: EncoderName = "aap") -> EncodedClouds:
         """The observation's cloud under a module's encoder, computed once."""
         entry = self._entry(observation)
         if module not in entry.encoded:
@@ -83,82 +83,103 @@ class Adapter:
         return entry.encoded[module]
 
     @torch.inference_mode()
-    def z(self, history: Sequence[Interaction]) -> Tensor:
+    def z(self, history: Sequence[Interaction], module: AdaptiveName = "aap") -> Tensor:
         """The hidden information in a history, [latent_width]; order does not matter, and none is allowed."""
         latent = self.policy.config.latent_width
         codes, weights = torch.zeros(0, latent), torch.zeros(0)
         if history:
-            parts = [self._interaction_code(interaction) for interaction in history]
+            parts = [self._interaction_code(interaction, module) for interaction in history]
             codes, weights = torch.cat([code for code, _ in parts]), torch.cat([weight for _, weight in parts])
-        return self.policy.aap.latent(codes, weights)
+        return self._adaptive(module).latent(codes, weights)
 
     @torch.inference_mode()
-    def affordance(self, observation: Observation, history: Sequence[Interaction]) -> Float32:
+    def affordance(
+        self, observation: Observation, history: Sequence[Interaction], module: AdaptiveName = "aap"
+    ) -> Float32:
         """A_I: the AAP actionability of every point after a history, [N], in [0, 1]."""
         everywhere = np.arange(len(observation.points))
-        features, places = self._features(observation, "aap", everywhere), self._points(observation, everywhere)
-        return self.policy.aap.actionability(features, places, self.z(history)).numpy()
+        features, places = self.features(observation, module, everywhere), self.places(observation, everywhere)
+        return self._adaptive(module).actionability(features, places, self.z(history, module)).numpy()
 
     @torch.inference_mode()
     def prior_affordance(self, observation: Observation) -> Float32:
         """A: Where2Act's actionability of every point, [N], in [0, 1]."""
-        features = self._features(observation, "prior", np.arange(len(observation.points)))
+        features = self.features(observation, "prior", np.arange(len(observation.points)))
         return self.policy.prior.actionability(features).numpy()
 
     @torch.inference_mode()
-    def score(self, observation: Observation, actions: Sequence[Action], history: Sequence[Interaction]) -> Float32:
+    def score(
+        self,
+        observation: Observation,
+        actions: Sequence[Action],
+        history: Sequence[Interaction],
+        module: AdaptiveName = "aap",
+    ) -> Float32:
         """The AAP scores s_u|z of actions after a history, [A], in [0, 1]."""
-        indices = np.array([action.point_index for action in actions], dtype=np.int64)
-        features = self._features(observation, "aap", indices)
-        points, frames = self._points(observation, indices), frames_in_view(observation, actions)
-        return torch.sigmoid(self.policy.aap.action_logits(features, points, frames, self.z(history))).numpy()
+        indices = point_indices(actions)
+        features = self.features(observation, module, indices)
+        points, frames = self.places(observation, indices), frames_in_view(observation, actions)
+        logits = self._adaptive(module).action_logits(features, points, frames, self.z(history, module))
+        return torch.sigmoid(logits).numpy()
 
     @torch.inference_mode()
     def prior_score(self, observation: Observation, actions: Sequence[Action]) -> Float32:
         """Where2Act's scores of actions, [A], in [0, 1]."""
-        indices = np.array([action.point_index for action in actions], dtype=np.int64)
-        features = self._features(observation, "prior", indices)
-        points, frames = self._points(observation, indices), frames_in_view(observation, actions)
+        indices = point_indices(actions)
+        features = self.features(observation, "prior", indices)
+        points, frames = self.places(observation, indices), frames_in_view(observation, actions)
         return torch.sigmoid(self.policy.prior.action_logits(features, points, frames)).numpy()
+
+    @torch.inference_mode()
+    def features(self, observation: Observation, module: EncoderName, points: NDArray[np.int64]) -> Tensor:
+        """f_p|O of a module at points of a cloud, [len(points), feature_width]."""
+        index = torch.from_numpy(points)
+        return self._encoder(module).at(self.encode(observation, module), torch.zeros_like(index), index)
+
+    def places(self, observation: Observation, points: NDArray[np.int64]) -> Tensor:
+        """Places as actions are told them: p less the middle of what may be moved, [len(points), 3]."""
+        entry = self._entry(observation)
+        return entry.clouds.points[0, torch.from_numpy(points)] - entry.middle
 
     @torch.inference_mode()
     def proposals(self, observation: Observation, point: int, rng: np.random.Generator) -> Proposals:
         """Rotations at a point, from the prior's Action Proposal Network."""
         noise = rng.standard_normal((PROPOSALS, self.policy.config.noise_width)).astype(np.float32)
-        features = self._features(observation, "prior", np.array([point]))
+        features = self.features(observation, "prior", np.array([point]))
         return Proposals(point, self.policy.prior.propose(features, torch.from_numpy(noise)))
 
     @torch.inference_mode()
-    def score_proposals(self, observation: Observation, proposals: Proposals, latent: Tensor) -> Tensor:
+    def score_proposals(
+        self, observation: Observation, proposals: Proposals, latent: Tensor, module: AdaptiveName = "aap"
+    ) -> Tensor:
         """The AAP scores s_u|z of proposals, [S]."""
         index = np.array([proposals.point])
-        features = self._features(observation, "aap", index)
-        points = self._points(observation, index)
-        return torch.sigmoid(self.policy.aap.action_logits(features, points, proposals.frames, latent))
+        features, points = self.features(observation, module, index), self.places(observation, index)
+        return torch.sigmoid(self._adaptive(module).action_logits(features, points, proposals.frames, latent))
 
     @torch.inference_mode()
     def prior_score_proposals(self, observation: Observation, proposals: Proposals) -> Tensor:
         """Where2Act's scores of proposals, [S]."""
         index = np.array([proposals.point])
-        features = self._features(observation, "prior", index)
-        points = self._points(observation, index)
+        features = self.features(observation, "prior", index)
+        points = self.places(observation, index)
         return torch.sigmoid(self.policy.prior.action_logits(features, points, proposals.frames))
 
     @torch.inference_mode()
     def information_proposals(self, observation: Observation, proposals: Proposals, latent: Tensor) -> Tensor:
         """The AIP scores s^AIP_u|z of proposals, [S]."""
         index = np.array([proposals.point])
-        features = self._features(observation, "aip", index)
+        features = self.features(observation, "aip", index)
         scores = self.score_proposals(observation, proposals, latent)
-        points = self._points(observation, index)
+        points = self.places(observation, index)
         return self.policy.aip.action_scores(features, points, proposals.frames, latent, scores)
 
     @torch.inference_mode()
     def information(self, observation: Observation, points: NDArray[np.int64], latent: Tensor) -> Float32:
         """The AIP actionability a^AIP_p|z of the points at the indices `points`, [len(points)]."""
-        places = self._points(observation, points)
-        expected = self.policy.aap.actionability(self._features(observation, "aap", points), places, latent)
-        features = self._features(observation, "aip", points)
+        places = self.places(observation, points)
+        expected = self.policy.aap.actionability(self.features(observation, "aap", points), places, latent)
+        features = self.features(observation, "aip", points)
         return self.policy.aip.actionability(features, latent, expected).numpy()
 
     def _entry(self, observation: Observation) -> _Entry:
@@ -173,103 +194,31 @@ class Adapter:
         self._entries.move_to_end(id(observation))
         return entry
 
-    def _encoder(self, module: Literal["prior", "aap", "aip"]) -> PointNet2:
-        policy = self.policy
-        return {"prior": policy.prior.encoder, "aap": policy.aap.encoder, "aip": policy.aip.encoder}[module]
+    def _adaptive(self, module: AdaptiveName) -> Aap:
+        if module == "aap":
+            return self.policy.aap
+        self.policy.require(module)
+        assert self.policy.where2act_interaction is not None, "a trained module is there"
+        return self.policy.where2act_interaction
 
-    def _features(
-        self, observation: Observation, module: Literal["prior", "aap", "aip"], points: NDArray[np.int64]
-    ) -> Tensor:
-        """A module's features at points of a cloud, [len(points), feature_width]."""
-        index = torch.from_numpy(points)
-        return self._encoder(module).at(self.encode(observation, module), torch.zeros_like(index), index)
+    def _encoder(self, module: EncoderName) -> PointNet2:
+        match module:
+            case "prior":
+                return self.policy.prior.encoder
+            case "aip":
+                return self.policy.aip.encoder
+            case _:
+                return self._adaptive(module).encoder
 
-    def _points(self, observation: Observation, points: NDArray[np.int64]) -> Tensor:
-        """Places as actions are told them, [len(points), 3]."""
-        entry = self._entry(observation)
-        return entry.clouds.points[0, torch.from_numpy(points)] - entry.middle
-
-    def _interaction_code(self, interaction: Interaction) -> tuple[Tensor, Tensor]:
+    def _interaction_code(self, interaction: Interaction, module: AdaptiveName) -> tuple[Tensor, Tensor]:
         index = np.array([interaction.action.point_index])
-        return self.policy.aap.interaction_codes(
-            self._features(interaction.observation, "aap", index),
-            self._points(interaction.observation, index),
+        return self._adaptive(module).interaction_codes(
+            self.features(interaction.observation, module, index),
+            self.places(interaction.observation, index),
             frames_in_view(interaction.observation, [interaction.action]),
             torch.tensor([interaction.outcome.motion], dtype=torch.float32),
             torch.tensor([float(interaction.outcome.success)]),
         )
-
-
-class AipProposer:
-    """What to try next, by the AIP module (AdaAfford, Next-step Interaction Action Proposal).
-
-    The point with the highest AIP actionability among the movable ones, and there the best by the AIP critic of 100
-    rotations from the prior's proposal network. Stops when the budget is reached, or when the highest actionability is
-    below the threshold (AdaAfford, Stopping Criterion).
-
-    Deviation: `at_least` tries are made whatever the threshold says, since no history at all tells nothing.
-    """
-
-    name = "aip"
-
-    def __init__(
-        self,
-        adapter: Adapter,
-        rng: np.random.Generator,
-        budget: int,
-        threshold: float = STOP_THRESHOLD,
-        at_least: int = 1,
-    ) -> None:
-        adapter.policy.require("prior", "aap", "aip")
-        self.adapter = adapter
-        self.rng = rng
-        self.budget = budget
-        self.threshold = threshold
-        self.at_least = at_least
-
-    def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
-        """The next action, or None to stop."""
-        if len(history) >= self.budget:
-            return None
-        candidates = movable_points(observation)
-        latent = self.adapter.z(history)
-        information = self.adapter.information(observation, candidates, latent)
-        if len(history) >= self.at_least and float(information.max()) < self.threshold:
-            return None
-        point = int(candidates[information.argmax()])
-        proposals = self.adapter.proposals(observation, point, self.rng)
-        best = int(self.adapter.information_proposals(observation, proposals, latent).argmax())
-        return action_from_frame(observation, point, proposals.frames[best])
-
-
-class ExploitProposer:
-    """The action that a critic believes in most (AdaAfford, Evaluation Metrics, sample-success).
-
-    A random one of the 100 movable points with the highest actionability, and there the best by the critic of 100
-    rotations from the prior's proposal network. "aap" uses the history; "where2act" is the prior and ignores it.
-    """
-
-    def __init__(self, adapter: Adapter, rng: np.random.Generator, module: Literal["aap", "where2act"] = "aap") -> None:
-        adapter.policy.require("prior", *(("aap",) if module == "aap" else ()))
-        self.name = module
-        self.adapter = adapter
-        self.rng = rng
-
-    def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
-        """The action to execute; never None."""
-        adapter, uses_history = self.adapter, self.name == "aap"
-        candidates = movable_points(observation)
-        scores = adapter.affordance(observation, history) if uses_history else adapter.prior_affordance(observation)
-        # A stable sort makes the choice among equal scores independent of the machine.
-        best_first = candidates[np.argsort(-scores[candidates], kind="stable")]
-        point = int(self.rng.choice(best_first[:TOP_POINTS]))
-        proposals = adapter.proposals(observation, point, self.rng)
-        believed = (
-            adapter.score_proposals(observation, proposals, adapter.z(history))
-            if uses_history
-            else adapter.prior_score_proposals(observation, proposals)
-        )
-        return action_from_frame(observation, point, proposals.frames[int(believed.argmax())])
 
 
 def movable_points(observation: Observation) -> NDArray[np.int64]:
@@ -282,6 +231,11 @@ def movable_points(observation: Observation) -> NDArray[np.int64]:
     if not len(points):
         raise UsageError("the observation has no movable point; look from another side, or mark the points to act on")
     return points
+
+
+def point_indices(actions: Sequence[Action]) -> NDArray[np.int64]:
+    """Indices of the points that actions touch, [A]."""
+    return np.array([action.point_index for action in actions], dtype=np.int64)
 
 
 def frames_in_view(observation: Observation, actions: Sequence[Action]) -> Tensor:

@@ -7,9 +7,11 @@ range of a plan's rollouts and makes one *shard*. Nothing here knows who does th
 from dataclasses import dataclass
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from shared.configuration import CollectionConfig, StrictModel
+from shared.errors import UsageError
+from shared.methods import method_named
 from shared.tasks import Terms, task_named
 
 
@@ -28,6 +30,16 @@ class EvaluationConfig(StrictModel):
     budgets: tuple[int, ...] = (1, 2, 4)
     queries: int = Field(24, ge=1)
     """Random test interactions a rollout, which critics are asked about (F-score)."""
+
+    @field_validator("methods")
+    @classmethod
+    def _known(cls, methods: tuple[str, ...]) -> tuple[str, ...]:
+        for name in methods:
+            try:
+                method_named(name)
+            except UsageError as error:
+                raise ValueError(str(error)) from None
+        return methods
 
 
 class Setting(StrictModel):

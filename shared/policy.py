@@ -16,6 +16,8 @@ from shared.networks.aap import Aap
 from shared.networks.aip import Aip
 from shared.networks.configuration import NetworkConfig
 from shared.networks.prior import Prior
+from shared.networks.where2act_adaptation import Where2ActAdaptation
+from shared.networks.where2act_interaction import Where2ActInteraction
 
 WEIGHTS_FILE = "weights.safetensors"
 POLICY_FILE = "policy.json"
@@ -23,7 +25,8 @@ POLICY_SCHEMA = 1
 MAX_POLICY_JSON_BYTES = 1 << 16
 MAX_WEIGHTS_BYTES = 1 << 30
 
-ModuleName = Literal["prior", "aap", "aip"]
+BaselineName = Literal["where2act-interaction", "where2act-adaptation"]
+ModuleName = Literal["prior", "aap", "aip", BaselineName]
 
 
 class PolicyDocument(StrictModel):
@@ -38,7 +41,7 @@ class PolicyDocument(StrictModel):
 
 
 class Policy:
-    """The prior, AAP and AIP of one task.
+    """The prior, AAP and AIP of one task, and the learnt baselines where somebody wanted them.
 
     Attributes:
         task: name of the task that they were trained for.
@@ -46,7 +49,9 @@ class Policy:
         prior: Where2Act.
         aap: Adaptive Affordance Prediction.
         aip: Adaptive Interaction Proposal.
-        trained: which of the three have been trained; the others hold their first random weights.
+        where2act_interaction: the baseline of that name; None until it is begun.
+        where2act_adaptation: the baseline of that name; None until it is begun.
+        trained: which modules have been trained; the others hold their first weights.
 
     Example:
         >>> policy = Policy.from_files(store.read_policy(3))
@@ -60,6 +65,8 @@ class Policy:
         self.prior = Prior(config)
         self.aap = Aap(config)
         self.aip = Aip(config)
+        self.where2act_interaction = Where2ActInteraction(config) if "where2act-interaction" in trained else None
+        self.where2act_adaptation = Where2ActAdaptation(config) if "where2act-adaptation" in trained else None
 
     @classmethod
     def untrained(cls, task: str, config: NetworkConfig, seed: int) -> "Policy":
@@ -69,9 +76,23 @@ class Policy:
             torch.manual_seed(seed)
             return cls(task, config)
 
+    def begin_baseline(self, name: BaselineName, seed: int) -> None:
+        """Make a learnt baseline anew, as it is before training; `seed` as for `untrained`."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            if name == "where2act-interaction":
+                self.where2act_interaction = Where2ActInteraction.starting_from(self.prior)
+            else:
+                self.where2act_adaptation = Where2ActAdaptation(self.config)
+
     def modules(self) -> nn.ModuleDict:
-        """The three modules by name."""
-        return nn.ModuleDict({"prior": self.prior, "aap": self.aap, "aip": self.aip})
+        """The modules that there are, by name."""
+        modules: dict[str, nn.Module] = {"prior": self.prior, "aap": self.aap, "aip": self.aip}
+        if self.where2act_interaction is not None:
+            modules["where2act-interaction"] = self.where2act_interaction
+        if self.where2act_adaptation is not None:
+            modules["where2act-adaptation"] = self.where2act_adaptation
+        return nn.ModuleDict(modules)
 
     def with_trained(self, name: ModuleName) -> "Policy":
         """This policy, with `name` counted among the trained modules from here on."""
@@ -88,7 +109,7 @@ class Policy:
             if name not in self.trained:
                 known = ", ".join(sorted(self.trained)) or "none"
                 raise UsageError(
-                    f"this policy's {name} is not trained (trained: {known}); run `python -m learner {name}`"
+                    f"this policy's {name} is not trained (trained: {known}); run `adaafford train {name}`"
                 )
 
     def to_files(self) -> dict[str, bytes]:

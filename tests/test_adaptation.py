@@ -8,8 +8,6 @@ import pytest
 
 from shared.adaptation import (
     Adapter,
-    AipProposer,
-    ExploitProposer,
     action_from_frame,
     frames_in_view,
     movable_points,
@@ -18,6 +16,7 @@ from shared.errors import UsageError
 from shared.geometry import camera_pose, gripper_rotation
 from shared.networks.configuration import NetworkConfig
 from shared.policy import Policy
+from shared.proposers import AipProposer, ExploitProposer
 from shared.vocabulary import Action, Interaction, Observation, Outcome, OutcomeKind, Proposer
 from tests.fabricate import fabricate_observation
 from tests.test_networks import TINY

@@ -12,7 +12,6 @@ from collector.catalogue import for_task, load_ref, scan
 from collector.clock import StageClock
 from collector.draws import draw_rollout, object_of
 from collector.environment import draw_state
-from collector.evaluation import method_named
 from collector.primitives import Trial
 from collector.procedural import generate
 from collector.proposers import LEAST_COSINE, RandomProposer, edge_points, random_rotation
@@ -22,6 +21,7 @@ from collector.worker import Worker
 from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import ObjectError, UsageError
 from shared.geometry import camera_pose
+from shared.methods import method_named
 from shared.plan import EvaluationConfig, Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import Store
@@ -49,7 +49,7 @@ class Named(RandomProposer):
         return super().propose(observation, history)
 
 
-def no_policy(name: str, rng: np.random.Generator) -> Proposer:
+def no_policy(name: str, rng: np.random.Generator, version: int) -> Proposer:
     return Named(name, rng)
 
 

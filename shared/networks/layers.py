@@ -82,6 +82,19 @@ class Head(nn.Module):
         )
         self.output = nn.Linear(config.feature_width, width_out)
 
+    @torch.no_grad()
+    def start_from(self, other: "Head") -> None:
+        """Compute what `other`, a head without products, makes of the first inputs; the further ones change nothing."""
+        assert not len(other.factors)
+        for place, weight in enumerate(self.inputs):
+            weight.copy_(other.inputs[place] if place < len(other.inputs) else torch.zeros_like(weight))
+        self.bias.copy_(other.bias)
+        self.output.load_state_dict(other.output.state_dict())
+        if len(self.factors):
+            # The other factor keeps its weights, so that the product has a gradient and can be learnt.
+            for parameter in self.factors[-1].parameters():
+                parameter.zero_()
+
     def forward(self, *inputs: Tensor) -> Tensor:
         """Inputs [..., width_in] with leading axes that broadcast, to [..., width_out]."""
         hidden: Tensor = self.bias

@@ -1,0 +1,65 @@
+"""The methods that are compared: who fills the set of interactions, who acts on it, and with which policy.
+
+They share one loop and differ in one thing each (AdaAfford, Baselines and Ablation Study, and its supplement).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from shared.errors import UsageError
+
+CriticName = Literal["where2act", "aap", "where2act-interaction", "where2act-adaptation"]
+TriesName = Literal["random", "aip", "fps", "purefps", "argfps", "where2act-fps"]
+
+FIRST_VERSION = 1
+"""The policy of the first round of the alternation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One method.
+
+    Attributes:
+        tries: who fills the set of interactions; None: nobody.
+        critic: whose scores and actionability are judged, and choose the action in the end.
+        in_one_shot: the number of tries that it takes whatever the budget, where it takes no other.
+        version: the policy version that it uses; None: the one that is evaluated.
+    """
+
+    tries: TriesName | None
+    critic: CriticName
+    in_one_shot: int | None = None
+    version: int | None = None
+
+    def budgets(self, wanted: Sequence[int]) -> list[int]:
+        """The numbers of tries after which it is judged, in ascending order."""
+        return sorted(set(wanted)) if self.in_one_shot is None else [self.in_one_shot]
+
+    def policy_version(self, evaluated: int) -> int:
+        """The policy version that it uses where version `evaluated` is evaluated."""
+        return evaluated if self.version is None else min(self.version, evaluated)
+
+
+METHODS = {
+    "where2act": Method(None, "where2act"),
+    "where2act-interaction": Method("where2act-fps", "where2act-interaction", in_one_shot=4),
+    "where2act-adaptation": Method("where2act-fps", "where2act-adaptation"),
+    "ours-random": Method("random", "aap"),
+    "ours-purefps": Method("purefps", "aap"),
+    "ours-argfps": Method("argfps", "aap"),
+    "ours-fps": Method("fps", "aap"),
+    "ours-no-iteration": Method("aip", "aap", version=FIRST_VERSION),
+    "ours-final": Method("aip", "aap"),
+}
+
+
+def method_named(name: str) -> Method:
+    """The method called `name`.
+
+    Raises:
+        UsageError: there is no such method; the message lists those there are.
+    """
+    if name not in METHODS:
+        raise UsageError(f"unknown method '{name}'; allowed: {', '.join(METHODS)}")
+    return METHODS[name]
