@@ -22,12 +22,11 @@ from cluster.configuration import CampaignConfig
 from cluster.fleet import Fleet, make_worker
 from cluster.ledger import Ledger
 from cluster.locking import only_driver
-from cluster.objects import objects_for
+from cluster.objects import lists_of, objects_for, split_as_told
 from cluster.run_folder import ObjectsUsed, RunFolder
 from cluster.session import FleetMaker, fleets
 from cluster.stages import Stage, run_stages
 from cluster.training import Trainer
-from collector.catalogue import split
 from shared.errors import UsageError
 from shared.files import write_atomically
 from shared.plan import Plan, Setting
@@ -109,10 +108,9 @@ class Campaign:
         run, config = self._run, self._config
         task = task_named(config.task)
         per_category = config.procedural.per_category
-        catalogue, folder = objects_for(
-            task, config.objects, run.generated_objects.resolve(), per_category, config.seed
-        )
-        parts = split((entry.ref for entry in catalogue.usable), config.splits.fractions, config.seed)
+        built_in, lists = run.generated_objects.resolve(), lists_of(config.splits)
+        catalogue, folder = objects_for(task, config, built_in, per_category, config.seed, lists)
+        parts = split_as_told((entry.ref for entry in catalogue.usable), config.splits, config.seed)
         if not parts.train or not parts.test:
             raise UsageError(
                 f"{folder}: {len(catalogue.usable)} usable objects are too few to train on some and test on others"

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from pydantic import Field, field_validator, model_validator
 
+from cluster.selection import ObjectSelection
 from learner.configuration import AapConfig, AipConfig, PriorConfig
 from shared.configuration import CollectionConfig, StrictModel
 from shared.networks.configuration import NetworkConfig
@@ -27,11 +28,17 @@ class RolloutCounts(StrictModel):
 
 
 class SplitConfig(StrictModel):
-    """Shares of the objects, within each category."""
+    """Which objects are trained on: shares within each category, unless lists or categories say what is tested on."""
 
     train: float = Field(0.7, gt=0, le=1)
     validation: float = Field(0.1, ge=0, le=1)
     test: float = Field(0.2, gt=0, le=1)
+    train_list: Path | None = None
+    """A list of `<id> <category>` lines: train on these, and test on all others unless `test_list` says which."""
+    test_list: Path | None = None
+    """Likewise: test on these, and train on all others unless `train_list` says which."""
+    test_categories: tuple[str, ...] = ()
+    """Test on these categories and train on all others; "test" stands for the paper's five."""
 
     @property
     def fractions(self) -> tuple[float, float, float]:
@@ -43,6 +50,18 @@ class SplitConfig(StrictModel):
         if abs(sum(self.fractions) - 1) > 1e-6:
             raise ValueError(f"train, validation and test must sum to 1; given {self.fractions}")
         return self
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "SplitConfig":
+        if self.test_categories and (self.train_list or self.test_list):
+            raise ValueError("what is tested on is said by lists or by test_categories, not by both")
+        return self
+
+    @field_validator("train_list", "test_list")
+    @classmethod
+    def _absolute(cls, path: Path | None) -> Path | None:
+        """A run may be resumed from another working folder."""
+        return None if path is None else path.expanduser().resolve()
 
 
 class ProceduralConfig(StrictModel):
@@ -61,13 +80,11 @@ class LearnerSettings(StrictModel):
     aip: AipConfig = AipConfig()
 
 
-class CampaignConfig(StrictModel):
+class CampaignConfig(ObjectSelection):
     """One campaign: a random round, then alternating training and AIP rounds, then evaluation on unseen objects."""
 
     task: str = "pull-closed-door"
     """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
-    objects: Path | None = None
-    """A folder of objects in PartNet-Mobility's layout; built-in procedural objects where none is given."""
     seed: int = Field(1, ge=0, lt=2**63)
     """Everything random derives from it."""
     alternations: int = Field(1, ge=0, le=1000)
@@ -84,9 +101,3 @@ class CampaignConfig(StrictModel):
     """Of a running Ray cluster; a private session on this machine where none is given."""
     job_limit_s: float = Field(300.0, gt=0)
     """A worker that takes longer for one job is taken for hung, and replaced."""
-
-    @field_validator("objects")
-    @classmethod
-    def _absolute(cls, path: Path | None) -> Path | None:
-        """The run may be resumed from another working folder."""
-        return None if path is None else path.expanduser().resolve()

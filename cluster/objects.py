@@ -1,33 +1,92 @@
-"""Which objects a run uses: a folder that the user names, or built-in procedural ones that are generated once."""
+"""Which objects a run uses: a folder that the user names, or built-in procedural ones; and which it is tested on."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
-from collector.catalogue import Catalogue, for_task, scan
+from cluster.configuration import SplitConfig
+from cluster.selection import ObjectSelection
+from collector.catalogue import Catalogue, ObjectSplit, for_task, of_categories, read_list, scan, split
 from collector.procedural.catalogue import CATEGORIES
 from collector.procedural.writing import generate
+from shared.categories import expanded
 from shared.errors import UsageError
+from shared.plan import ObjectRef
 from shared.tasks import Task
 
 
-def objects_for(task: Task, given: Path | None, built_in: Path, per_category: int, seed: int) -> tuple[Catalogue, Path]:
+def objects_for(
+    task: Task,
+    selection: ObjectSelection,
+    built_in: Path,
+    per_category: int,
+    seed: int,
+    lists: tuple[Path, ...] = (),
+) -> tuple[Catalogue, Path]:
     """The catalogue of objects that suit `task`, and the folder that they lie in.
 
     Args:
         task: what is to be done with them.
-        given: the user's folder; None for built-in objects.
+        selection: the user's folder, list and categories; without a folder, built-in objects are made.
         built_in: where those are generated, and found again.
         per_category: how many of each category that the task applies to.
         seed: of the built-in objects.
+        lists: where the selection has no list, only objects of these are looked at.
 
     Raises:
-        UsageError: the folder cannot be read, or nothing in it suits the task.
+        UsageError: the folder or a list cannot be read, or nothing in it suits the task.
     """
-    folder = given.expanduser().resolve() if given is not None else built_in
-    if given is None:
-        categories = [name for name in CATEGORIES if not task.categories or name in task.categories]
-        generate(built_in, dict.fromkeys(categories, per_category), seed)
-    catalogue = for_task(scan(folder), task)
+    categories, folder = expanded(selection.categories), selection.objects or built_in
+    if selection.objects is None:
+        wanted = [name for name in categories or CATEGORIES if not task.categories or name in task.categories]
+        generate(built_in, dict.fromkeys(wanted, per_category), seed)
+    lists = lists if selection.object_list is None else (selection.object_list,)
+    catalogue = for_task(of_categories(scan(folder, *lists), categories), task)
     if not catalogue.usable:
         why = f"; the first: {catalogue.refused[0][0]}: {catalogue.refused[0][1]}" if catalogue.refused else ""
         raise UsageError(f"{folder}: none of {len(catalogue.refused)} objects suits the task '{task.name}'{why}")
     return catalogue, folder
+
+
+def lists_of(splits: SplitConfig) -> tuple[Path, ...]:
+    """The lists that together name every object that is used; none where others are used as well."""
+    if splits.train_list is None or splits.test_list is None:
+        return ()
+    return splits.train_list, splits.test_list
+
+
+def split_as_told(refs: Iterable[ObjectRef], splits: SplitConfig, seed: int) -> ObjectSplit:
+    """Split objects by the lists or categories that the user names, else by shares within each category.
+
+    Where it is said what is tested on, train and validation share the others in the proportion of their fractions.
+
+    Raises:
+        UsageError: a list cannot be read, or the lists have an object in common.
+    """
+    refs = tuple(refs)
+    if splits.test_categories:
+        categories = expanded(splits.test_categories)
+        tested = {ref.id for ref in refs if ref.category in categories}
+        trained = {ref.id for ref in refs} - tested
+    elif splits.train_list is not None or splits.test_list is not None:
+        trained, tested = _listed({ref.id for ref in refs}, splits)
+    else:
+        return split(refs, splits.fractions, seed)
+    both = splits.train + splits.validation
+    shares = (splits.train / both, splits.validation / both, 0.0)
+    parts = split((ref for ref in refs if ref.id in trained), shares, seed)
+    test = sorted((ref for ref in refs if ref.id in tested), key=lambda ref: ref.id)
+    return ObjectSplit(parts.train, parts.validation, tuple(test))
+
+
+def _listed(ids: set[str], splits: SplitConfig) -> tuple[set[str], set[str]]:
+    """Which of `ids` are trained on and which are tested on, where there is a list of either."""
+    train, test = (None if path is None else set(read_list(path)) for path in (splits.train_list, splits.test_list))
+    if train is None:
+        train = ids - (test or set())
+    if test is None:
+        test = ids - train
+    if common := sorted(train & test):
+        raise UsageError(
+            f"{splits.test_list}: '{common[0]}' is in {splits.train_list} too; test on objects that are not trained on"
+        )
+    return ids & train, ids & test

@@ -4,7 +4,7 @@ A catalogue keeps a few words an object; geometry is read when it is wanted (`lo
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -67,19 +67,20 @@ class ObjectSplit:
     test: tuple[ObjectRef, ...]
 
 
-def scan(path: Path, object_list: Path | None = None) -> Catalogue:
+def scan(path: Path, *object_lists: Path) -> Catalogue:
     """Read and check every object below `path`.
 
     Args:
         path: a folder of object folders, or one object's folder. Files and hidden folders in it are ignored.
-        object_list: a Where2Act list, `<id> <category>` a line; only these objects are looked at.
+        object_lists: Where2Act lists, `<id> <category>` a line; where there are any, only their objects are looked at.
 
     Raises:
-        UsageError: `path` or the list cannot be read, or there is no object at all.
+        UsageError: `path` or a list cannot be read, or there is no object at all.
     """
     folders = _object_folders(path)
-    if object_list is not None:
-        folders = {object_id: folders.get(object_id, path / object_id) for object_id in read_list(object_list)}
+    if object_lists:
+        listed = dict.fromkeys(object_id for each in object_lists for object_id in read_list(each))
+        folders = {object_id: folders.get(object_id, path / object_id) for object_id in listed}
     elif not any((folder / URDF_FILE).is_file() for folder in folders.values()):
         raise UsageError(f"{path}: holds no object; name a folder of <id>/{URDF_FILE}, or one <id> itself")
     usable, refused = [], []
@@ -98,8 +99,9 @@ def read_list(path: Path) -> tuple[str, ...]:
         UsageError: the list cannot be read, or a line does not start with an id.
     """
     try:
-        if path.stat().st_size > MAX_LIST_BYTES:
-            raise UsageError(f"{path}: larger than {MAX_LIST_BYTES} bytes; not a list of objects")
+        # What is missing fails here, with its reason; a pipe is never opened, since reading it could block for ever.
+        if path.stat().st_size > MAX_LIST_BYTES or not path.is_file():
+            raise UsageError(f"{path}: not a file of at most {MAX_LIST_BYTES} bytes; name '<id> <category>' lines")
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise UsageError(f"{path}: cannot be read ({error.strerror}); name a list of '<id> <category>' lines") from None
@@ -141,14 +143,18 @@ def load_ref(path: Path, ref: ObjectRef, collision: Collision = "hulls") -> Arti
 
 def for_task(catalogue: Catalogue, task: Task) -> Catalogue:
     """The catalogue in which only objects that `task` may act on are usable."""
-    fit = [bool(qualifying_parts(entry, task)) for entry in catalogue.usable]
-    reasons = [
-        (entry.ref.id, _unfit_reason(entry, task))
-        for entry, fits in zip(catalogue.usable, fit, strict=True)
-        if not fits
-    ]
-    usable = tuple(entry for entry, fits in zip(catalogue.usable, fit, strict=True) if fits)
-    return Catalogue(usable, tuple(sorted([*catalogue.refused, *reasons])))
+    return _without(catalogue, lambda entry: None if qualifying_parts(entry, task) else _unfit_reason(entry, task))
+
+
+def of_categories(catalogue: Catalogue, categories: Collection[str]) -> Catalogue:
+    """The catalogue in which only objects of some categories are usable; of any where none is named."""
+
+    def reason(entry: CatalogueEntry) -> str | None:
+        if not categories or entry.ref.category in categories:
+            return None
+        return f"a {entry.ref.category}; only {', '.join(categories)} are asked for"
+
+    return _without(catalogue, reason)
 
 
 def qualifying_parts(described: CatalogueEntry | ArticulatedObject, task: Task) -> tuple[int, ...]:
@@ -229,6 +235,14 @@ def _qualifies(part: PartSummary, task: Task) -> bool:
     named = not task.part_names or any(name in part.name for name in task.part_names)
     turns = part.kind == "revolute" or not task.revolute_only
     return named and turns and part.visible and part.span > MIN_RANGE
+
+
+def _without(catalogue: Catalogue, reason: Callable[[CatalogueEntry], str | None]) -> Catalogue:
+    """The catalogue in which every object that there is a reason against is refused for it."""
+    reasons = [(entry, reason(entry)) for entry in catalogue.usable]
+    refused = [(entry.ref.id, against) for entry, against in reasons if against is not None]
+    usable = tuple(entry for entry, against in reasons if against is None)
+    return Catalogue(usable, tuple(sorted([*catalogue.refused, *refused])))
 
 
 def _unfit_reason(entry: CatalogueEntry, task: Task) -> str:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from pydantic import Field
 
+from cluster.selection import ObjectSelection
 from cluster.settings import parse_flags
-from shared.configuration import FIDELITIES, CollectionConfig, Fidelity, StrictModel
+from shared.configuration import FIDELITIES, CollectionConfig, Fidelity
 from shared.errors import UsageError
 from shared.tasks import task_named
 from shared.vocabulary import Primitive
@@ -22,13 +23,11 @@ if TYPE_CHECKING:
 ACTIONS = ("fidelity", "dynamics", "collect")
 
 
-class BenchSettings(StrictModel):
+class BenchSettings(ObjectSelection):
     """What every benchmark may be told."""
 
     task: str = "push"
     """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
-    objects: Path | None = None
-    """A folder of objects in PartNet-Mobility's layout; built-in procedural objects where none is given."""
     primitive: Primitive | None = None
     """Instead of the task's own primitive."""
     seed: int = Field(1, ge=0, lt=2**63)
@@ -204,7 +203,7 @@ def _planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
     config = task.resolve(command.collection.model_copy(update=own))
     with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
         built_in = Path(scratch) / "objects"
-        catalogue, folder = objects_for(task, command.objects, built_in, command.procedural_per_category, command.seed)
+        catalogue, folder = objects_for(task, command, built_in, command.procedural_per_category, command.seed)
         refs = tuple(entry.ref for entry in catalogue.usable)
         yield Plan(setting=Setting(task=task.name, seed=command.seed, objects=refs, collection=config)), folder
 

@@ -8,19 +8,18 @@ from typing import Annotated, Literal
 import tyro
 from pydantic import Field
 
+from cluster.selection import ObjectSelection
 from cluster.settings import early_flags, layered, parse_flags
-from shared.configuration import CollectionConfig, StrictModel
+from shared.configuration import CollectionConfig
 from shared.errors import UsageError
 from shared.tasks import task_named
 
 
-class CollectSettings(StrictModel):
+class CollectSettings(ObjectSelection):
     """What `adaafford collect` may be told by a file as well."""
 
     task: str = "push"
     """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
-    objects: Path | None = None
-    """A folder of objects in PartNet-Mobility's layout; built-in procedural objects where none is given."""
     rollouts: int = Field(100, ge=1)
     """How many the store shall hold of this plan, those of earlier attempts included."""
     per_shard: int = Field(4, ge=1, le=4096)
@@ -78,7 +77,7 @@ def _collect(command: CollectCommand) -> None:
     chosen, path = command.settings, command.store.resolve()
     catalogue, folder = objects_for(
         task_named(chosen.task),
-        chosen.objects,
+        chosen,
         path.with_name(f"{path.name}-objects"),
         chosen.procedural_per_category,
         chosen.seed,

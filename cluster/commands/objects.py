@@ -35,6 +35,10 @@ class CheckCommand:
     """A folder of objects, or one object's folder."""
     task: str | None = None
     """Say as well which objects suit this task."""
+    object_list: Path | None = None
+    """Only the objects of this list, `<id> <category>` a line, such as Where2Act publishes."""
+    categories: tuple[str, ...] = ()
+    """Only objects of these; "train" and "test" stand for the paper's ten and five."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +90,12 @@ def _generate(command: GenerateCommand) -> int:
 
 
 def _check(command: CheckCommand) -> int:
-    from collector.catalogue import for_task, scan
+    from collector.catalogue import for_task, of_categories, scan
+    from shared.categories import expanded
     from shared.tasks import task_named
 
-    catalogue = scan(command.path)
+    lists = () if command.object_list is None else (command.object_list,)
+    catalogue = of_categories(scan(command.path, *lists), expanded(command.categories))
     if command.task is not None:
         catalogue = for_task(catalogue, task_named(command.task))
     lines = {entry.ref.id: f"usable: {entry.ref.category}, {_parts(len(entry.parts))}" for entry in catalogue.usable}
