@@ -69,19 +69,26 @@ def order_rows(
         proposed_first: how often the tries that a policy proposed come first, in the order in which they were made
             (AdaAfford, Training Strategy: AAP is fine-tuned with the proposed interactions).
     """
-    width = min(size, max(len(dataset.rollouts[number]) for number in rollouts))
-    rows = np.zeros((len(rollouts), width), dtype=np.int64)
-    valid = np.zeros((len(rollouts), width), dtype=bool)
-    proposed = dataset.rows.proposed.numpy()
-    for place, number in enumerate(rollouts):
+    orders, proposed = [], dataset.rows.proposed.numpy()
+    for number in rollouts:
         order = rng.permutation(dataset.rollouts[number].numpy())
         if rng.random() < proposed_first:
             # The rows of a rollout are in order of step, so that a sort by row is a sort by step.
             first = np.array([row for row in dataset.rollouts[number].tolist() if proposed[row]], dtype=np.int64)
             order = np.concatenate([first, order[~proposed[order]]])
-        order = order[:width]
-        rows[place], valid[place, : len(order)] = order[0], True
-        rows[place, : len(order)] = order
+        orders.append(order)
+    return padded(dataset, orders, size)
+
+
+def padded(dataset: Dataset, orders: Sequence[NDArray[np.int64]], size: int) -> OrderedRows:
+    """Ordered rows of equal length: at most the first `size` of each, padded to the longest."""
+    width = min(size, max(map(len, orders)))
+    rows = np.zeros((len(orders), width), dtype=np.int64)
+    valid = np.zeros((len(orders), width), dtype=bool)
+    for place, order in enumerate(orders):
+        kept = order[:width]
+        rows[place], valid[place, : len(kept)] = kept[0], True
+        rows[place, : len(kept)] = kept
     clouds, cloud = torch.unique(dataset.rows.cloud[torch.from_numpy(rows)], return_inverse=True)
     return OrderedRows(torch.from_numpy(rows), torch.from_numpy(valid), clouds, cloud)
 
