@@ -16,11 +16,15 @@ from learner.losses import action_scoring_loss, distillation_loss
 from learner.metrics import discrimination
 from learner.oracle import OracleCritic
 from learner.sampling import Batch, draw_numbers, order_rows, spread
+from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aap import Aap
 
 VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 20
+CURVE = (0, 1, 2, 4, 8)
+"""Numbers of tries after which a validation says how well AAP does, as far as its context reaches."""
+CURVE_FIGURES = ("bce", "f_score", "auc", "calibration_error")
 _CHUNK = 4
 """Rollouts validated at once."""
 
@@ -84,7 +88,10 @@ class AapStage:
         rollouts = [train[number] for number in chosen]
         ordered = order_rows(self.dataset, rollouts, config.rows_per_rollout, rng, config.proposed_first)
         context = ordered.longest_context(config.context)
-        batch = Batch.of(self.dataset, ordered, draw_turns(len(rollouts), config.augmentation, rng))
+        turns = draw_turns(len(rollouts), config.augmentation, rng)
+        mine = share(len(rollouts))
+        total, ordered = int(ordered.valid.sum()), ordered.select(mine)
+        batch = Batch.of(self.dataset, ordered, turns[mine])
         prediction = predict(self.aap, batch, context)
         asked = ordered.asked(context)
         losses = {"critic": action_scoring_loss(prediction.logits, batch.success[:, None], asked)}
@@ -94,14 +101,14 @@ class AapStage:
                 surer = torch.sigmoid(self.oracle.logits(batch))[:, None]
             losses["imitation"] = config.imitation * action_scoring_loss(prediction.logits, surer, asked)
             losses["distillation"] = config.distillation * distillation_loss(prediction.latents, told, asked.any(-1))
-        return StepResult(losses, int(ordered.valid.sum()))
+        return StepResult(losses, total)
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Figures on objects not trained on, before and after the longest context; "score" is over all prefixes."""
+        """Figures on objects not trained on after each number of tries; "score" is over all prefixes."""
         rng = np.random.default_rng(_VALIDATION_SEED)
         rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
-        scores: tuple[list[Tensor], list[Tensor]] = ([], [])
+        scores: dict[int, list[Tensor]] = {tries: [] for tries in CURVE if tries <= self.config.context}
         labels, losses = [], []
         for start in range(0, len(rollouts), _CHUNK):
             ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
@@ -111,20 +118,15 @@ class AapStage:
             success, asked = batch.success, ordered.asked(context)
             losses.append(action_scoring_loss(prediction.logits, success[:, None], asked))
             asked_last = asked[:, -1]
-            for kept, prefix in zip(scores, (0, -1), strict=True):
-                kept.append(torch.sigmoid(prediction.logits[:, prefix][asked_last]))
+            for tries, kept in scores.items():
+                kept.append(torch.sigmoid(prediction.logits[:, min(tries, context)][asked_last]))
             labels.append(success[asked_last])
-        before, after = (discrimination(torch.cat(kept).numpy(), torch.cat(labels).numpy()) for kept in scores)
-        return {
-            "score": float(torch.stack(losses).mean()),
-            "bce_without_tries": before.bce,
-            "bce_with_tries": after.bce,
-            "f_without_tries": before.f_score,
-            "f_with_tries": after.f_score,
-            "auc_without_tries": before.auc,
-            "auc_with_tries": after.auc,
-            "base_rate": after.base_rate,
-        }
+        known = torch.cat(labels).numpy(force=True)
+        figures = {"score": float(torch.stack(losses).mean()), "base_rate": float(known.mean())}
+        for tries, kept in scores.items():
+            found = discrimination(torch.cat(kept).numpy(force=True), known)
+            figures |= {f"{name}_after_{tries}": getattr(found, name) for name in CURVE_FIGURES}
+        return figures
 
     @torch.no_grad()
     def _told(self, batch: Batch, valid: Tensor) -> Tensor:
@@ -157,9 +159,12 @@ class OracleStage:
         train = self.parts.train
         chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
         ordered = order_rows(self.dataset, [train[k] for k in chosen], self.config.rows_per_rollout, rng)
-        batch = Batch.of(self.dataset, ordered, draw_turns(len(chosen), self.config.augmentation, rng))
+        turns = draw_turns(len(chosen), self.config.augmentation, rng)
+        mine = share(len(chosen))
+        total, ordered = int(ordered.valid.sum()), ordered.select(mine)
+        batch = Batch.of(self.dataset, ordered, turns[mine])
         loss = action_scoring_loss(self.critic.logits(batch), batch.success, ordered.valid)
-        return StepResult({"critic": loss}, int(ordered.valid.sum()))
+        return StepResult({"critic": loss}, total)
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -172,8 +177,9 @@ class OracleStage:
             batch = Batch.of(self.dataset, ordered)
             scores.append(torch.sigmoid(self.critic.logits(batch))[ordered.valid])
             labels.append(batch.success[ordered.valid])
-        found = discrimination(torch.cat(scores).numpy(), torch.cat(labels).numpy())
-        return {"score": found.bce, "f_score": found.f_score, "auc": found.auc, "base_rate": found.base_rate}
+        found = discrimination(torch.cat(scores).numpy(force=True), torch.cat(labels).numpy(force=True))
+        figures = {name: getattr(found, name) for name in CURVE_FIGURES}
+        return {"score": found.bce, "base_rate": found.base_rate} | figures
 
 
 def predict(aap: Aap, batch: Batch, context: int) -> Prediction:

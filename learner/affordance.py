@@ -21,6 +21,7 @@ from learner.frozen import FrozenAap
 from learner.losses import actionability_loss, mean_score, top_score
 from learner.metrics import rank_correlation
 from learner.sampling import ProposalPool, draw_numbers, order_rows, spread
+from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aip import Aip
 from shared.networks.prior import Prior
@@ -47,6 +48,12 @@ class Questions:
     point: Tensor
     frames: Tensor
     latents: Tensor
+
+    def select(self, places: slice) -> "Questions":
+        """Some of them."""
+        return Questions(
+            self.cloud[places], self.slot[places], self.point[places], self.frames[places], self.latents[places]
+        )
 
 
 class Answer(Protocol):
@@ -90,8 +97,9 @@ class AffordanceStage:
         """The loss at some points of a few rollouts' clouds."""
         train = self.parts.train
         chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
-        predicted, target = self.answer(self._questions([train[number] for number in chosen], rng))
-        return StepResult({"affordance": actionability_loss(predicted, target)}, len(predicted))
+        questions = self._questions([train[number] for number in chosen], rng)
+        predicted, target = self.answer(questions.select(share(len(questions.cloud))))
+        return StepResult({"affordance": actionability_loss(predicted, target)}, len(questions.cloud))
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -105,21 +113,22 @@ class AffordanceStage:
             "score": score,
             "affordance": score,
             "affordance_of_median": float((target - target.median()).abs().mean()),
-            "affordance_rank_correlation": rank_correlation(predicted.numpy(), target.numpy()),
+            "affordance_rank_correlation": rank_correlation(predicted.numpy(force=True), target.numpy(force=True)),
         }
 
     def _questions(self, rollouts: Sequence[int], rng: np.random.Generator) -> Questions:
         config, count = self.config, self.config.points
         ordered = order_rows(self.dataset, rollouts, config.context + 1, rng)
-        which = torch.from_numpy(rng.integers(0, len(rollouts), count))
-        row = torch.from_numpy(_below(ordered.valid.sum(dim=1).numpy()[which.numpy()], rng))
+        drawn = rng.integers(0, len(rollouts), count)
+        which = torch.as_tensor(drawn)
+        row = torch.as_tensor(_below(ordered.valid.sum(dim=1).numpy(force=True)[drawn], rng))
         cloud = ordered.clouds[ordered.cloud[which, row]]
-        slot = torch.from_numpy(rng.integers(0, self.pool.point.shape[1], count))
+        slot = torch.as_tensor(rng.integers(0, self.pool.point.shape[1], count))
         latents = torch.zeros(count, 0)
         if self.frozen is not None:
             context = ordered.longest_context(config.context)
             prefixes = self.frozen.latents(ordered.rows[:, :context])
-            latents = prefixes[which, torch.from_numpy(rng.integers(0, context + 1, count))]
+            latents = prefixes[which, torch.as_tensor(rng.integers(0, context + 1, count))]
         frames = self.pool.draw(cloud, slot, config.proposals, rng)
         place = self.dataset.clouds.points[cloud, self.pool.point[cloud, slot]] - self.dataset.middles[cloud]
         return Questions(cloud, slot, place, frames, latents)

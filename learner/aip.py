@@ -15,6 +15,7 @@ from learner.frozen import FrozenAap
 from learner.losses import action_scoring_losses, information_gains, information_loss, mean_information_loss
 from learner.metrics import correlation
 from learner.sampling import OrderedRows, draw_numbers, order_rows, spread
+from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aip import Aip
 
@@ -71,9 +72,10 @@ class AipStage:
         train = self.parts.train
         chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
         ordered = self._order([train[number] for number in chosen], rng)
+        total, ordered = int(ordered.valid.sum()), ordered.select(share(len(ordered.rows)))
         found = self.gains(ordered)
         predicted = self._predict(ordered, found)
-        return StepResult({"critic": self._loss(predicted, found.gains, found.mask)}, int(ordered.valid.sum()))
+        return StepResult({"critic": self._loss(predicted, found.gains, found.mask)}, total)
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -98,7 +100,7 @@ class AipStage:
             "critic": critic,
             "critic_of_constant": float(self._loss(constant.expand_as(gains), gains, everything)),
             "mean_gain": float(gains.mean()),
-            "correlation": correlation(guesses.numpy(), gains.numpy()),
+            "correlation": correlation(guesses.numpy(force=True), gains.numpy(force=True)),
         }
 
     @torch.no_grad()

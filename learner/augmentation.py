@@ -23,7 +23,7 @@ def draw_turns(count: int, config: AugmentationConfig, rng: np.random.Generator)
     turns[:, 0, 0], turns[:, 0, 1] = cos, -sin * sign
     turns[:, 1, 0], turns[:, 1, 1] = sin, cos * sign
     turns[:, 2, 2] = 1.0
-    return torch.from_numpy(turns)
+    return torch.as_tensor(turns)
 
 
 def turn_vectors(turns: Tensor, vectors: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from learner import sharing
 from learner.configuration import LearnerConfig
 from shared.errors import UsageError
 
+
 @dataclass(frozen=True, slots=True)
 class Hardware:
     """Where and how to compute.

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from learner.sharing import averaged, shared_mean
 from shared.networks.actions import geodesic_distance
 from shared.networks.aip import SCORE_SCALE
 
@@ -17,11 +18,12 @@ def action_scoring_loss(logits: Tensor, successes: Tensor, mask: Tensor | None =
         mask: which entries count; None: all. Where none counts, the loss is 0.
     """
     losses = action_scoring_losses(logits, successes)
-    return losses.mean() if mask is None else masked_mean(losses, mask)
+    return masked_mean(losses, torch.ones_like(losses, dtype=torch.bool) if mask is None else mask)
 
 
 def action_scoring_losses(logits: Tensor, successes: Tensor) -> Tensor:
     """Binary cross entropy of each action score, nats, [...]."""
+    logits = logits.float()
     return functional.binary_cross_entropy_with_logits(logits, successes.expand_as(logits), reduction="none")
 
 
@@ -33,8 +35,9 @@ def proposal_loss(proposals: Tensor, frames: Tensor) -> Tensor:
         frames: approach and forward that succeeded, [Q, 6]; where there are none, the loss is 0.
     """
     if not len(frames):
-        return proposals.sum() * 0.0
-    return geodesic_distance(proposals, frames[:, None]).min(dim=1).values.mean()
+        return shared_mean(proposals.sum() * 0.0, proposals.new_zeros(()))
+    nearest = geodesic_distance(proposals, frames[:, None]).min(dim=1).values
+    return shared_mean(nearest.sum(), nearest.new_tensor(float(len(nearest))))
 
 
 def actionability_loss(predicted: Tensor, target: Tensor) -> Tensor:
@@ -50,6 +53,15 @@ def mean_score(scores: Tensor) -> Tensor:
 def top_score(scores: Tensor, top: int) -> Tensor:
     """A point's actionability by AdaAfford: the mean of the `top` best scores, [..., S] to [...]."""
     return scores.topk(min(top, scores.shape[-1]), dim=-1).values.mean(dim=-1)
+
+
+def correction_loss(corrected: Tensor, successes: Tensor, mask: Tensor) -> Tensor:
+    """Squared error of corrected scores (AdaAfford, supplement, Details of Baselines).
+
+    "We use the ground truth result of the action as the regression target": the paper does not name the loss. A cross
+    entropy would need scores within [0, 1], and L1 would find the median of what is 0 or 1.
+    """
+    return masked_mean((corrected - successes).square(), mask)
 
 
 def information_gains(losses: Tensor) -> Tensor:
@@ -89,11 +101,12 @@ def distillation_loss(latents: Tensor, target: Tensor, mask: Tensor) -> Tensor:
         mask: which prefixes count, [B, K + 1].
     """
     target = target.detach()
-    spread = target.var(dim=0, unbiased=False).mean() + 1e-2
+    mean = averaged(target.mean(dim=0))
+    spread = averaged((target - mean).square().mean()) + 1e-2
     return masked_mean((latents - target[:, None]).square().mean(dim=-1) / spread, mask)
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean of the values that count; 0 where none does."""
+    """Mean of the values that count, over all processes that share a batch; 0 where none does."""
     weights = mask.expand_as(values).to(values.dtype)
-    return torch.where(weights > 0, values, torch.zeros_like(values)).sum() / weights.sum().clamp_min(1.0)
+    return shared_mean(torch.where(weights > 0, values, torch.zeros_like(values)).sum(), weights.sum())

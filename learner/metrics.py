@@ -7,6 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 THRESHOLD = 0.5
 """Where a score counts as a predicted success, as in the published code."""
+CALIBRATION_BINS = 10
+"""Of equal width, for the calibration error."""
 _MIN_PROBABILITY = 1e-7
 
 
@@ -19,6 +21,7 @@ class Discrimination:
         best_f_score: F1 at the threshold that is best in hindsight.
         bce: binary cross entropy, nats.
         auc: area under the ROC curve; ties count half.
+        calibration_error: expected difference between what is predicted and what happens (ECE).
         base_rate: share of successes.
         rows: how many.
     """
@@ -27,6 +30,7 @@ class Discrimination:
     best_f_score: float
     bce: float
     auc: float
+    calibration_error: float
     base_rate: float
     rows: int
 
@@ -45,6 +49,7 @@ def discrimination(scores: ArrayLike, successes: ArrayLike) -> Discrimination:
         best_f_score=best_f_score(probabilities, labels),
         bce=cross_entropy(probabilities, labels),
         auc=area_under_roc(probabilities, labels),
+        calibration_error=calibration_error(probabilities, labels),
         base_rate=float(labels.mean()) if len(labels) else float("nan"),
         rows=len(labels),
     )
@@ -74,6 +79,15 @@ def cross_entropy(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> flo
         return float("nan")
     clipped = np.clip(scores, _MIN_PROBABILITY, 1.0 - _MIN_PROBABILITY)
     return float(-np.log(np.where(labels, clipped, 1.0 - clipped)).mean())
+
+
+def calibration_error(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:
+    """Expected calibration error: mean over rows of |mean score - share of successes| of the row's bin, ten bins."""
+    if not len(labels):
+        return float("nan")
+    bins = np.minimum((scores * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
+    surplus = np.bincount(bins, weights=scores - labels, minlength=CALIBRATION_BINS)
+    return float(np.abs(surplus).sum() / len(labels))
 
 
 def area_under_roc(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:

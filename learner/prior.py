@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from learner.augmentation import draw_turns, turn_vectors
@@ -16,6 +17,7 @@ from learner.data import Dataset, Split
 from learner.losses import action_scoring_loss, proposal_loss
 from learner.metrics import discrimination
 from learner.sampling import draw_numbers, frozen_features, spread
+from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
 from shared.networks.prior import Prior
 
@@ -35,6 +37,7 @@ class PriorStage:
         self.dataset = dataset
         self.config = config
         self._rows_of_cloud = _rows_of_clouds(dataset, parts.train)
+        self._succeeded = dataset.rows.success.numpy(force=True) > 0
         self._validation = torch.cat([dataset.rollouts[number] for number in parts.validation])
 
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -44,32 +47,46 @@ class PriorStage:
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """Both losses on the rows of a few clouds."""
-        chosen = draw_numbers(len(self._rows_of_cloud), min(self.config.batch_clouds, len(self._rows_of_cloud)), rng)
+        chosen = np.sort(draw_numbers(len(self._rows_of_cloud), self._batch(), rng))
         most = self.config.actions_per_cloud
         picked = [rng.permutation(self._rows_of_cloud[number])[:most] for number in chosen]
-        index = torch.from_numpy(np.concatenate(picked))
         turns = draw_turns(len(chosen), self.config.augmentation, rng)
-        return StepResult(self._losses(index, rng, turns), len(index))
+        rows = np.concatenate(picked)
+        noise = self._noise(rows, rng)
+        mine = share(len(chosen))
+        taken = np.isin(np.repeat(np.arange(len(picked)), [len(rows) for rows in picked]), np.arange(len(picked))[mine])
+        noise = noise[torch.as_tensor(taken[self._succeeded[rows]])]
+        losses = self._losses(torch.as_tensor(rows[taken]), noise, turns[mine])
+        return StepResult(losses, len(rows))
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
         """Figures on objects not trained on; "score" is the sum of both losses on some of their rows."""
         scores, success = self.scores(self._validation), self.dataset.rows.success[self._validation]
-        losses = self._losses(
-            torch.tensor(spread(self._validation.tolist(), VALIDATION_ROWS)), np.random.default_rng(_VALIDATION_SEED)
-        )
-        found = discrimination(scores.numpy(), success.numpy())
+        judged = np.array(spread(self._validation.tolist(), VALIDATION_ROWS))
+        noise = self._noise(judged, np.random.default_rng(_VALIDATION_SEED))
+        losses = self._losses(torch.as_tensor(judged), noise)
+        found = discrimination(scores.numpy(force=True), success.numpy(force=True))
         return {
             "score": float(torch.stack(list(losses.values())).sum()),
             "bce": found.bce,
             "f_score": found.f_score,
             "auc": found.auc,
+            "calibration_error": found.calibration_error,
             "base_rate": found.base_rate,
             "proposal": float(losses["proposal"]),
         }
 
-    def _losses(self, index: Tensor, rng: np.random.Generator, turns: Tensor | None = None) -> dict[str, Tensor]:
-        """Both losses on rows, seen after a turn for each of their clouds."""
+    def _batch(self) -> int:
+        return min(self.config.batch_clouds, len(self._rows_of_cloud))
+
+    def _noise(self, rows: NDArray[np.int64], rng: np.random.Generator) -> Tensor:
+        """What the proposals at each success among the rows are drawn from, [successes, S, noise_width]."""
+        shape = (int(self._succeeded[rows].sum()), self.config.proposals, self.prior.config.noise_width)
+        return torch.as_tensor(rng.standard_normal(shape).astype(np.float32))
+
+    def _losses(self, index: Tensor, noise: Tensor, turns: Tensor | None = None) -> dict[str, Tensor]:
+        """Both losses on rows, seen after a turn for each of their clouds, which are in order."""
         rows, prior = self.dataset.rows, self.prior
         clouds, cloud = torch.unique(rows.cloud[index], return_inverse=True)
         seen = self.dataset.clouds.select(clouds)
@@ -79,8 +96,6 @@ class PriorStage:
             xyz, frames = (turn_vectors(turns[cloud], vectors[:, None])[:, 0] for vectors in (xyz, frames))
         features = prior.encoder.at(prior.encoder(seen), cloud, rows.point[index])
         succeeded = success > 0
-        shape = (int(succeeded.sum()), self.config.proposals, prior.config.noise_width)
-        noise = torch.from_numpy(rng.standard_normal(shape).astype(np.float32))
         proposals = prior.propose(features[succeeded][:, None], noise)
         return {
             "critic": action_scoring_loss(prior.action_logits(features, xyz, frames), success),
@@ -98,6 +113,6 @@ class PriorStage:
 def _rows_of_clouds(dataset: Dataset, rollouts: tuple[int, ...]) -> list[np.ndarray]:
     """The rows of each cloud that the rollouts have."""
     rows = torch.cat([dataset.rollouts[number] for number in rollouts])
-    cloud = dataset.rows.cloud[rows].numpy()
+    cloud = dataset.rows.cloud[rows].numpy(force=True)
     order = np.argsort(cloud, kind="stable")
     return np.split(rows.numpy()[order], np.flatnonzero(np.diff(cloud[order])) + 1)

@@ -38,6 +38,13 @@ class OrderedRows:
     clouds: Tensor
     cloud: Tensor
 
+    def select(self, places: slice) -> "OrderedRows":
+        """Some of the sets."""
+        if places == slice(0, None, 1):
+            return self
+        clouds, which = torch.unique(self.cloud[places], return_inverse=True)
+        return OrderedRows(self.rows[places], self.valid[places], self.clouds[clouds], which)
+
     def longest_context(self, limit: int) -> int:
         """The longest context, of at most `limit` tries, that leaves a row to ask about."""
         return min(limit, self.rows.shape[1] - 1)
@@ -69,7 +76,7 @@ def order_rows(
         proposed_first: how often the tries that a policy proposed come first, in the order in which they were made
             (AdaAfford, Training Strategy: AAP is fine-tuned with the proposed interactions).
     """
-    orders, proposed = [], dataset.rows.proposed.numpy()
+    orders, proposed = [], dataset.rows.proposed.numpy(force=True)
     for number in rollouts:
         order = rng.permutation(dataset.rollouts[number].numpy())
         if rng.random() < proposed_first:
@@ -89,8 +96,9 @@ def padded(dataset: Dataset, orders: Sequence[NDArray[np.int64]], size: int) -> 
         kept = order[:width]
         rows[place], valid[place, : len(kept)] = kept[0], True
         rows[place, : len(kept)] = kept
-    clouds, cloud = torch.unique(dataset.rows.cloud[torch.from_numpy(rows)], return_inverse=True)
-    return OrderedRows(torch.from_numpy(rows), torch.from_numpy(valid), clouds, cloud)
+    index = torch.as_tensor(rows)
+    clouds, cloud = torch.unique(dataset.rows.cloud[index], return_inverse=True)
+    return OrderedRows(index, torch.as_tensor(valid), clouds, cloud)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,10 +163,10 @@ class ProposalPool:
     def of(cls, dataset: Dataset, prior: Prior, rng: np.random.Generator) -> "ProposalPool":
         """Draw the points once for all of a training stage, since the prior does not change in it."""
         chosen = []
-        for movable in dataset.movable.numpy():
+        for movable in dataset.movable.numpy(force=True):
             candidates = np.flatnonzero(movable) if movable.any() else np.arange(len(movable))
             chosen.append(rng.choice(candidates, POOL_POINTS))
-        point = torch.from_numpy(np.stack(chosen))
+        point = torch.as_tensor(np.stack(chosen))
         return cls(point, _features_of_all(prior.encoder, dataset.clouds, point), prior)
 
     def features_under(self, encoder: PointNet2, clouds: CloudBatch) -> Tensor:
@@ -169,7 +177,7 @@ class ProposalPool:
     def draw(self, cloud: Tensor, slot: Tensor, count: int, rng: np.random.Generator) -> Tensor:
         """`count` rotations at points of the pool, given by cloud and slot, [Q] each; [Q, count, 6]."""
         noise = rng.standard_normal((len(cloud), count, self.prior.config.noise_width)).astype(np.float32)
-        return self.prior.propose(self.features[cloud, slot][:, None], torch.from_numpy(noise))
+        return self.prior.propose(self.features[cloud, slot][:, None], torch.as_tensor(noise))
 
 
 @torch.no_grad()

@@ -99,10 +99,10 @@ def test_aap_learns_to_read_a_try(coin_dataset: Dataset) -> None:
     stage = AapStage(policy.aap, coin_dataset, EVERYTHING, AapConfig(context=4, batch_rollouts=8))
     descend(stage, 80)
     figures = stage.validate()
-    assert figures["bce_with_tries"] < 0.25
-    assert figures["f_with_tries"] > 0.9
+    assert figures["bce_after_4"] < 0.25
+    assert figures["f_score_after_4"] > 0.9
     # Without a try the coin may only be guessed, unless the cloud is learnt by heart.
-    assert figures["bce_without_tries"] > 2 * figures["bce_with_tries"]
+    assert figures["bce_after_0"] > 2 * figures["bce_after_4"]
 
 
 def test_the_oracle_knows_and_aap_learns_from_it(coin_dataset: Dataset) -> None:
