@@ -6,8 +6,9 @@ say in which critic is kept. A step needs no point encoder, since features under
 Shapes: B rollouts, K the longest context, Q questions (a point and a z), S proposals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -20,12 +21,14 @@ from learner.data import Dataset, Split
 from learner.frozen import FrozenAap
 from learner.losses import actionability_loss, mean_score, top_score
 from learner.metrics import rank_correlation
-from learner.sampling import ProposalPool, draw_numbers, order_rows, spread
+from learner.sampling import OrderedRows, ProposalPool, draw_numbers, order_rows, spread
 from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aip import Aip
 from shared.networks.prior import Prior
 
+RowOrder = Callable[[Sequence[int], int, np.random.Generator], OrderedRows]
+"""Orders rows of rollouts, at most so many of each."""
 VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 22
 _VALIDATION_BATCHES = 8
@@ -79,7 +82,22 @@ class AffordanceStage:
         config: AffordanceConfig,
         pool: ProposalPool,
         frozen: FrozenAap | None = None,
+        order: RowOrder | None = None,
+        shortest: int = 0,
     ) -> None:
+        """Collect what a stage needs.
+
+        Args:
+            name: of the stage.
+            answer: D, and its critic.
+            dataset: the interactions.
+            parts: which of them to learn from.
+            config: how.
+            pool: points and proposals.
+            frozen: whose z is asked about; None for Where2Act, which has none.
+            order: draws the tries; at random where it is not given.
+            shortest: the fewest tries whose z is asked about, where a rollout has as many.
+        """
         self.name = name
         self.module = answer.module.requires_grad_(True)
         self.answer = answer
@@ -88,6 +106,8 @@ class AffordanceStage:
         self.config = config
         self.pool = pool
         self.frozen = frozen
+        self.order = order or partial(order_rows, dataset)
+        self.shortest = shortest
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """D alone."""
@@ -118,7 +138,7 @@ class AffordanceStage:
 
     def _questions(self, rollouts: Sequence[int], rng: np.random.Generator) -> Questions:
         config, count = self.config, self.config.points
-        ordered = order_rows(self.dataset, rollouts, config.context + 1, rng)
+        ordered = self.order(rollouts, config.context + 1, rng)
         drawn = rng.integers(0, len(rollouts), count)
         which = torch.as_tensor(drawn)
         row = torch.as_tensor(_below(ordered.valid.sum(dim=1).numpy(force=True)[drawn], rng))
@@ -128,7 +148,7 @@ class AffordanceStage:
         if self.frozen is not None:
             context = ordered.longest_context(config.context)
             prefixes = self.frozen.latents(ordered.rows[:, :context])
-            latents = prefixes[which, torch.as_tensor(rng.integers(0, context + 1, count))]
+            latents = prefixes[which, torch.as_tensor(rng.integers(min(self.shortest, context), context + 1, count))]
         frames = self.pool.draw(cloud, slot, config.proposals, rng)
         place = self.dataset.clouds.points[cloud, self.pool.point[cloud, slot]] - self.dataset.middles[cloud]
         return Questions(cloud, slot, place, frames, latents)

@@ -116,6 +116,29 @@ class AipConfig(TrainingConfig):
     affordance: AffordanceConfig = AffordanceConfig(context=4)
 
 
+class InteractionConfig(TrainingConfig):
+    """The baseline Where2Act-interaction, which starts from the prior."""
+
+    steps: int = Field(80, ge=1)
+    validate_every: int = Field(20, ge=1)
+    batch_rollouts: int = Field(12, ge=1)
+    rows_per_rollout: int = Field(32, ge=2)
+    augmentation: AugmentationConfig = AugmentationConfig()
+    inherited_rate: float = Field(0.2, ge=0, le=1)
+    """Factor of the learning rate for the prior's encoder."""
+    affordance: AffordanceConfig = AffordanceConfig(steps=150)
+
+
+class AdaptationConfig(TrainingConfig):
+    """The baseline Where2Act-adaptation; only its similarities are trained."""
+
+    steps: int = Field(300, ge=1)
+    batch_rollouts: int = Field(16, ge=1)
+    rows_per_rollout: int = Field(32, ge=2)
+    context: int = Field(4, ge=1)
+    """The longest context; every shorter one is trained in the same pass."""
+
+
 class AlternationConfig(StrictModel):
     """When `adaafford train alternate` ends."""
 
@@ -142,3 +165,5 @@ class LearnerConfig(StrictModel):
     prior: PriorConfig = PriorConfig()
     aap: AapConfig = AapConfig()
     aip: AipConfig = AipConfig()
+    interaction: InteractionConfig = InteractionConfig()
+    adaptation: AdaptationConfig = AdaptationConfig()

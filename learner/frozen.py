@@ -1,4 +1,4 @@
-"""What a frozen AAP makes of a data set: computed once, since neither its weights nor the rows change any more."""
+"""What frozen networks make of a data set: computed once, since neither weights nor rows change any more."""
 
 from dataclasses import dataclass
 
@@ -8,6 +8,31 @@ from torch import Tensor
 from learner.data import Dataset
 from learner.sampling import ProposalPool, frozen_features
 from shared.networks.aap import Aap
+from shared.networks.prior import Prior
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenPrior:
+    """What a frozen Where2Act makes of every row.
+
+    Attributes:
+        features: f_p|O, [I, feature_width].
+        scores: s_u, [I].
+        actionability: a_p of the touched points, [I].
+    """
+
+    features: Tensor
+    scores: Tensor
+    actionability: Tensor
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, prior: Prior, dataset: Dataset) -> "FrozenPrior":
+        """Encode everything."""
+        rows = dataset.rows
+        features = frozen_features(prior.encoder, dataset.clouds, rows.cloud, rows.point)
+        scores = torch.sigmoid(prior.action_logits(features, rows.xyz, rows.frame))
+        return cls(features, scores, prior.actionability(features))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,55 +1,57 @@
-"""The three stages as jobs: a store and a policy in, a better policy out, finished at most once.
+"""Stages as jobs: a store and a policy in, a better policy out, finished at most once.
 
 OUT/ of a stage
     config.json            what it was told, resolved
     metrics.jsonl          one line a validation
     checkpoint.safetensors until it is done
-    affordance/            the last two of the affordance network
+    affordance/            the last two of the affordance network, where the stage has one
     oracle/                privileged AAP only: the same of the oracle critic, whose weights are in oracle.safetensors
     tensorboard/           the metrics again, for TensorBoard, where it is installed
-    weights.safetensors    the policy, all three modules
+    weights.safetensors    the policy, all its modules
     policy.json
     done.json              written last
 """
 
-import copy
 import hashlib
 import json
 from collections.abc import Collection
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
-
-import torch
-from safetensors.torch import save
 
 from learner import sharing
-from learner.aap import AapStage, OracleStage
-from learner.affordance import AapAnswer, AffordanceStage, AipAnswer, Answer, PriorAnswer
-from learner.aip import AipStage
 from learner.checkpoint import check_fingerprint, read_cursor
-from learner.configuration import AffordanceConfig, LearnerConfig, TrainingConfig
-from learner.data import Dataset, Split, load_dataset, split, without_later
-from learner.frozen import FrozenAap
+from learner.configuration import LearnerConfig
+from learner.data import load_dataset, split, without_later
 from learner.hardware import Hardware
-from learner.oracle import OracleCritic
-from learner.prior import PriorStage
-from learner.sampling import ProposalPool
-from learner.training import CHECKPOINT_FILE, METRICS_FILE, Stage, TrainingResult, train, without_nan
+from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FOLDER, Recipe, Runner
+from learner.training import CHECKPOINT_FILE, METRICS_FILE, TrainingResult, without_nan
 from shared.errors import UsageError
 from shared.files import read_bounded, write_atomically
-from shared.policy import MAX_POLICY_JSON_BYTES, MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE, Policy
-from shared.seeds import generator, torch_seed
+from shared.policy import (
+    MAX_POLICY_JSON_BYTES,
+    MAX_WEIGHTS_BYTES,
+    POLICY_FILE,
+    WEIGHTS_FILE,
+    ModuleName,
+    Policy,
+)
+from shared.seeds import torch_seed
 from shared.store.store import Store
 
 DONE_FILE = "done.json"
 CONFIG_FILE = "config.json"
-ORACLE_FILE = "oracle.safetensors"
-ORACLE_FOLDER = "oracle"
-AFFORDANCE_FOLDER = "affordance"
 CHECKPOINT_FOLDERS = ("", ORACLE_FOLDER, AFFORDANCE_FOLDER)
 
-StageName = Literal["prior", "aap", "aip"]
+StageName = ModuleName
+"""A stage is called by the module that it trains."""
+NEEDED: dict[StageName, tuple[ModuleName, ...]] = {
+    "prior": (),
+    "aap": ("prior",),
+    "aip": ("prior", "aap"),
+    "where2act-interaction": ("prior",),
+    "where2act-adaptation": ("prior",),
+}
+"""What must have been trained before; the last of them is the stage to start from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +113,8 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
     hardware = hardware or Hardware()
     policy.modules().to(hardware.device)
     with hardware.home():
-        runner = _Runner(job.out, config.seed, fingerprint, hardware)
-        result = _train(job, config, policy, dataset.on(hardware.device), parts, runner)
+        runner = Runner(job.out, config.seed, fingerprint, hardware)
+        result = Recipe(config, policy, dataset.on(hardware.device), parts, runner).train(job.stage)
     policy.modules().to("cpu")
     policy.with_trained(job.stage)
     if sharing.rank() == 0:
@@ -154,97 +156,16 @@ def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Polic
     task = store.setting.task
     if job.init is None:
         if job.stage != "prior":
-            before = {"aap": "prior", "aip": "aap"}[job.stage]
+            before = NEEDED[job.stage][-1]
             raise UsageError(f"the stage '{job.stage}' starts from a policy: add --init with the --out of '{before}'")
         return Policy.untrained(task, config.network, torch_seed(config.seed, "learner.weights") % 2**32)
     policy = read_policy_folder(job.init)
     if policy.task != task:
         raise UsageError(f"{job.init}: a policy for '{policy.task}', but the store is of '{task}'; use one of its task")
-    needed: dict[StageName, tuple[Literal["prior", "aap"], ...]] = {
-        "prior": (),
-        "aap": ("prior",),
-        "aip": ("prior", "aap"),
-    }
-    policy.require(*needed[job.stage])
+    policy.require(*NEEDED[job.stage])
+    if job.stage == "where2act-interaction" or job.stage == "where2act-adaptation":
+        policy.begin_baseline(job.stage, torch_seed(config.seed, f"learner.{job.stage}.weights") % 2**32)
     return policy
-
-
-def _train(
-    job: StageJob, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split, runner: "_Runner"
-) -> TrainingResult:
-    rng = generator(config.seed, f"learner.{job.stage}.pool")
-    policy.modules().eval().requires_grad_(False)
-    if job.stage == "prior":
-        policy.prior.requires_grad_(True)
-        result = runner.train(PriorStage(policy.prior, dataset, parts, config.prior), config.prior, "prior")
-        policy.prior.eval().requires_grad_(False)
-        pool = ProposalPool.of(dataset, policy.prior, rng)
-        prior_answer = PriorAnswer(policy.prior, pool)
-        affordance = AffordanceStage("prior-affordance", prior_answer, dataset, parts, config.prior.affordance, pool)
-        return runner.train_affordance(affordance, config.prior.affordance, result)
-    pool = ProposalPool.of(dataset, policy.prior, rng)
-    if job.stage == "aap":
-        policy.aap.requires_grad_(True)
-        oracle = None
-        # An AAP that has been trained has a z of its own, which a new oracle would only disturb.
-        if config.aap.training == "privileged" and "aap" not in policy.trained:
-            oracle = _train_oracle(runner, config, policy, dataset, parts)
-        result = runner.train(AapStage(policy.aap, dataset, parts, config.aap, oracle), config.aap, "aap")
-        frozen = FrozenAap.of(policy.aap, dataset, pool)
-        answer: Answer = AapAnswer(frozen, config.aap.top)
-        settings = config.aap.affordance
-    else:
-        policy.aip.requires_grad_(True)
-        frozen = FrozenAap.of(policy.aap, dataset, pool)
-        result = runner.train(AipStage(policy.aip, dataset, parts, config.aip, frozen), config.aip, "aip")
-        policy.aip.eval().requires_grad_(False)
-        features = pool.features_under(policy.aip.encoder, dataset.clouds)
-        answer = AipAnswer(policy.aip, features, frozen, config.aip.top)
-        settings = config.aip.affordance
-    affordance = AffordanceStage(f"{job.stage}-affordance", answer, dataset, parts, settings, pool, frozen)
-    return runner.train_affordance(affordance, settings, result)
-
-
-@dataclass(frozen=True, slots=True)
-class _Runner:
-    """Trains the networks of one stage one after the other, each with checkpoints of its own."""
-
-    out: Path
-    seed: int
-    fingerprint: str
-    hardware: Hardware
-
-    def train(self, stage: Stage, settings: TrainingConfig, title: str, subfolder: str = "") -> TrainingResult:
-        folder = self.out / subfolder
-        folder.mkdir(exist_ok=True)
-        return train(stage, settings, self.seed, folder, self.fingerprint, title, self.hardware)
-
-    def train_affordance(
-        self, stage: AffordanceStage, settings: AffordanceConfig, before: TrainingResult
-    ) -> TrainingResult:
-        """Train D; returns the critic's result with D's figures added."""
-        result = self.train(stage, settings, stage.name, AFFORDANCE_FOLDER)
-        stage.module.eval().requires_grad_(False)
-        figures = {name: value for name, value in result.metrics.items() if name != "score"}
-        return replace(before, seconds=before.seconds + result.seconds, metrics=before.metrics | figures)
-
-
-def _train_oracle(
-    runner: _Runner, config: LearnerConfig, policy: Policy, dataset: Dataset, parts: Split
-) -> OracleCritic:
-    """Train the oracle critic, save it, and start AAP from it."""
-    # Drawn on the CPU, so that the first weights are the same whatever device trains them.
-    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
-        torch.manual_seed(torch_seed(config.seed, "learner.oracle") % 2**32)
-        critic = OracleCritic(copy.deepcopy(policy.aap))
-    critic.to(runner.hardware.device)
-    settings = config.aap.model_copy(update={"steps": config.aap.oracle_steps})
-    runner.train(OracleStage(critic, dataset, parts, config.aap), settings, "oracle", ORACLE_FOLDER)
-    if sharing.rank() == 0:
-        write_atomically(runner.out / ORACLE_FILE, save({n: t.contiguous() for n, t in critic.state_dict().items()}))
-    for inherited in ("encoder", "action_encoder", "critic_head"):
-        getattr(policy.aap, inherited).load_state_dict(getattr(critic.aap, inherited).state_dict())
-    return critic
 
 
 def _fingerprint(job: StageJob, config: LearnerConfig, store: Store, policy: Policy) -> str:

@@ -118,9 +118,9 @@ def distances_to(points: Float, tried: Float) -> Float | None:
     return distances
 
 
-def actionable_points(actionability: Float32) -> NDArray[np.int64]:
-    """Indices of the points above the threshold, or of the best `LEAST_POINTS` where fewer are, in ascending order."""
+def actionable_points(actionability: Float32, least: int = LEAST_POINTS) -> NDArray[np.int64]:
+    """Indices of the points above the threshold, or of the best `least` where fewer are, in ascending order."""
     above = np.flatnonzero(actionability > THRESHOLD)
-    if len(above) >= LEAST_POINTS:
+    if len(above) >= least:
         return above
-    return np.sort(np.argsort(-actionability, kind="stable")[:LEAST_POINTS])
+    return np.sort(np.argsort(-actionability, kind="stable")[:least])

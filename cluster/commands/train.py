@@ -10,13 +10,15 @@ from cluster.settings import early_flags, layered, parse_flags
 from learner.configuration import LearnerConfig
 from shared.errors import UsageError
 
-STAGES = ("prior", "aap", "aip", "alternate")
+STAGES = ("prior", "aap", "aip", "where2act-interaction", "where2act-adaptation", "alternate")
 USAGE = f"""usage: adaafford train {{{",".join(STAGES)}}} --store STORE --out RUN [--init RUN] [SETTINGS]
 
   prior      the Where2Act prior, from nothing
   aap        Adaptive Affordance Prediction; --init names the --out of a prior
   aip        Adaptive Interaction Proposal; --init names the --out of an aap
-  alternate  all of them, and again until validation improves no more
+  where2act-interaction, where2act-adaptation
+             baselines of the paper, from a prior; the policy keeps what else it holds
+  alternate  prior, aap and aip, and the last two again until validation improves no more
 
 The same command again goes on where it was stopped. `torchrun --nproc-per-node N -m cluster train ...` shares each
 batch among N processes. `adaafford train prior --help` lists all settings."""

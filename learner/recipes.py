@@ -1,0 +1,172 @@
+"""What each stage trains, one network after the other."""
+
+import copy
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from safetensors.torch import save
+
+from learner import sharing
+from learner.aap import AapStage, OracleStage
+from learner.affordance import AapAnswer, AffordanceStage, AipAnswer, PriorAnswer
+from learner.aip import AipStage
+from learner.configuration import AffordanceConfig, LearnerConfig, TrainingConfig
+from learner.data import Dataset, Split
+from learner.frozen import FrozenAap, FrozenPrior
+from learner.hardware import Hardware
+from learner.oracle import OracleCritic
+from learner.prior import PriorStage
+from learner.sampling import ProposalPool
+from learner.training import Stage, TrainingResult, train
+from learner.where2act_adaptation import AdaptationStage
+from learner.where2act_interaction import InteractionStage
+from shared.files import write_atomically
+from shared.networks.where2act_interaction import TRIES
+from shared.policy import ModuleName, Policy
+from shared.seeds import generator, torch_seed
+
+ORACLE_FILE = "oracle.safetensors"
+ORACLE_FOLDER = "oracle"
+AFFORDANCE_FOLDER = "affordance"
+
+
+@dataclass(frozen=True, slots=True)
+class Runner:
+    """Trains the networks of one stage one after the other, each with checkpoints of its own."""
+
+    out: Path
+    seed: int
+    fingerprint: str
+    hardware: Hardware
+
+    def train(self, stage: Stage, settings: TrainingConfig, title: str, subfolder: str = "") -> TrainingResult:
+        """Train one network."""
+        folder = self.out / subfolder
+        folder.mkdir(exist_ok=True)
+        return train(stage, settings, self.seed, folder, self.fingerprint, title, self.hardware)
+
+    def train_affordance(
+        self, stage: AffordanceStage, settings: AffordanceConfig, before: TrainingResult
+    ) -> TrainingResult:
+        """Train D; returns the critic's result with D's figures added."""
+        result = self.train(stage, settings, stage.name, AFFORDANCE_FOLDER)
+        stage.module.eval().requires_grad_(False)
+        figures = {name: value for name, value in result.metrics.items() if name != "score"}
+        return replace(before, seconds=before.seconds + result.seconds, metrics=before.metrics | figures)
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What the stages have in common: a policy of which one module is trained, from what, and how."""
+
+    config: LearnerConfig
+    policy: Policy
+    dataset: Dataset
+    parts: Split
+    runner: Runner
+
+    def train(self, stage: ModuleName) -> TrainingResult:
+        """Train one module of the policy; the others stay as they are."""
+        self.policy.modules().eval().requires_grad_(False)
+        match stage:
+            case "prior":
+                return self._prior()
+            case "aap":
+                return self._aap()
+            case "aip":
+                return self._aip()
+            case "where2act-interaction":
+                return self._interaction()
+            case "where2act-adaptation":
+                return self._adaptation()
+
+    def _prior(self) -> TrainingResult:
+        prior, config = self.policy.prior.requires_grad_(True), self.config.prior
+        result = self.runner.train(PriorStage(prior, self.dataset, self.parts, config), config, "prior")
+        prior.eval().requires_grad_(False)
+        pool = self._pool("prior")
+        affordance = AffordanceStage(
+            "prior-affordance", PriorAnswer(prior, pool), self.dataset, self.parts, config.affordance, pool
+        )
+        return self.runner.train_affordance(affordance, config.affordance, result)
+
+    def _aap(self) -> TrainingResult:
+        aap, config, pool = self.policy.aap.requires_grad_(True), self.config.aap, self._pool("aap")
+        # An AAP that has been trained has a z of its own, which a new oracle would only disturb.
+        privileged = config.training == "privileged" and "aap" not in self.policy.trained
+        oracle = self._oracle() if privileged else None
+        result = self.runner.train(AapStage(aap, self.dataset, self.parts, config, oracle), config, "aap")
+        frozen = FrozenAap.of(aap, self.dataset, pool)
+        affordance = AffordanceStage(
+            "aap-affordance",
+            AapAnswer(frozen, config.top),
+            self.dataset,
+            self.parts,
+            config.affordance,
+            pool,
+            frozen,
+        )
+        return self.runner.train_affordance(affordance, config.affordance, result)
+
+    def _aip(self) -> TrainingResult:
+        aip, config, pool = self.policy.aip.requires_grad_(True), self.config.aip, self._pool("aip")
+        frozen = FrozenAap.of(self.policy.aap, self.dataset, pool)
+        result = self.runner.train(AipStage(aip, self.dataset, self.parts, config, frozen), config, "aip")
+        aip.eval().requires_grad_(False)
+        features = pool.features_under(aip.encoder, self.dataset.clouds)
+        answer = AipAnswer(aip, features, frozen, config.top)
+        affordance = AffordanceStage(
+            "aip-affordance", answer, self.dataset, self.parts, config.affordance, pool, frozen
+        )
+        return self.runner.train_affordance(affordance, config.affordance, result)
+
+    def _interaction(self) -> TrainingResult:
+        network, config = self.policy.where2act_interaction, self.config.interaction
+        assert network is not None, "a baseline is begun before it is trained"
+        pool, prior = self._pool("where2act-interaction"), FrozenPrior.of(self.policy.prior, self.dataset)
+        stage = InteractionStage(network.requires_grad_(True), self.dataset, self.parts, config, prior)
+        result = self.runner.train(stage, config, stage.name)
+        frozen = FrozenAap.of(network, self.dataset, pool)
+        # The mean of all proposals' scores, as Where2Act has it, and not of the best.
+        answer = AapAnswer(frozen, config.affordance.proposals)
+        settings = config.affordance.model_copy(update={"context": TRIES})
+        affordance = AffordanceStage(
+            f"{stage.name}-affordance",
+            answer,
+            self.dataset,
+            self.parts,
+            settings,
+            pool,
+            frozen,
+            order=stage.order,
+            shortest=TRIES,
+        )
+        return self.runner.train_affordance(affordance, settings, result)
+
+    def _adaptation(self) -> TrainingResult:
+        network, config = self.policy.where2act_adaptation, self.config.adaptation
+        assert network is not None, "a baseline is begun before it is trained"
+        prior = FrozenPrior.of(self.policy.prior, self.dataset)
+        stage = AdaptationStage(network.requires_grad_(True), self.dataset, self.parts, config, prior)
+        return self.runner.train(stage, config, stage.name)
+
+    def _pool(self, stage: ModuleName) -> ProposalPool:
+        return ProposalPool.of(self.dataset, self.policy.prior, generator(self.config.seed, f"learner.{stage}.pool"))
+
+    def _oracle(self) -> OracleCritic:
+        """Train the oracle critic, save it, and start AAP from it."""
+        # Drawn on the CPU, so that the first weights are the same whatever device trains them.
+        with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+            torch.manual_seed(torch_seed(self.config.seed, "learner.oracle") % 2**32)
+            critic = OracleCritic(copy.deepcopy(self.policy.aap))
+        critic.to(self.runner.hardware.device)
+        config = self.config.aap
+        settings = config.model_copy(update={"steps": config.oracle_steps})
+        self.runner.train(OracleStage(critic, self.dataset, self.parts, config), settings, "oracle", ORACLE_FOLDER)
+        if sharing.rank() == 0:
+            weights = save({name: tensor.contiguous() for name, tensor in critic.state_dict().items()})
+            write_atomically(self.runner.out / ORACLE_FILE, weights)
+        for inherited in ("encoder", "action_encoder", "critic_head"):
+            getattr(self.policy.aap, inherited).load_state_dict(getattr(critic.aap, inherited).state_dict())
+        return critic

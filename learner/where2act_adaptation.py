@@ -1,0 +1,111 @@
+"""Baseline Where2Act-adaptation: which points are so similar that a try at one corrects what is said of the other?
+
+Shapes: B ordered sets of interactions, n rows of each, K the longest context.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from learner.configuration import AdaptationConfig
+from learner.data import Dataset, Split
+from learner.frozen import FrozenPrior
+from learner.losses import correction_loss
+from learner.metrics import discrimination
+from learner.sampling import OrderedRows, draw_numbers, order_rows, spread
+from learner.sharing import share
+from learner.training import ParameterGroup, StepResult
+from shared.networks.where2act_adaptation import Where2ActAdaptation, influences
+
+VALIDATION_ROLLOUTS = 32
+_VALIDATION_SEED = 24
+
+
+class AdaptationStage:
+    """Trains the similarities, over a Where2Act that stays as it is (AdaAfford, supplement, Details of Baselines).
+
+    A random subset of a rollout's interactions is the context; all rows that are not in it are predicted, after each
+    of its prefixes. Everything that Where2Act says is computed once, so that a step costs a small perceptron.
+    """
+
+    name = "where2act-adaptation"
+
+    def __init__(
+        self,
+        network: Where2ActAdaptation,
+        dataset: Dataset,
+        parts: Split,
+        config: AdaptationConfig,
+        prior: FrozenPrior,
+    ) -> None:
+        self.module: nn.Module = network
+        self.network = network
+        self.dataset = dataset
+        self.parts = parts
+        self.config = config
+        self.prior = prior
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """The similarity network, at one rate."""
+        return [ParameterGroup(tuple(self.network.parameters()))]
+
+    def loss(self, rng: np.random.Generator) -> StepResult:
+        """The squared error of corrected scores on a few rollouts."""
+        train = self.parts.train
+        chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
+        ordered = order_rows(self.dataset, [train[number] for number in chosen], self.config.rows_per_rollout, rng)
+        total, ordered = int(ordered.valid.sum()), ordered.select(share(len(chosen)))
+        return StepResult({"correction": self._loss(ordered)}, total)
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Figures on objects not trained on; "score" is the loss."""
+        rng = np.random.default_rng(_VALIDATION_SEED)
+        rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
+        ordered = order_rows(self.dataset, rollouts, self.config.rows_per_rollout, rng)
+        context = ordered.longest_context(self.config.context)
+        asked = ordered.asked(context)[:, -1]
+        corrected = corrected_scores(self.network, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
+        success = self.dataset.rows.success[ordered.rows][asked].numpy(force=True)
+        before, after = (
+            discrimination(corrected[:, :, prefix][asked].clamp(0.0, 1.0).numpy(force=True), success)
+            for prefix in (0, -1)
+        )
+        return {
+            "score": float(self._loss(ordered)),
+            "bce_without_tries": before.bce,
+            "bce_with_tries": after.bce,
+            "f_without_tries": before.f_score,
+            "f_with_tries": after.f_score,
+            "base_rate": after.base_rate,
+        }
+
+    def _loss(self, ordered: OrderedRows) -> Tensor:
+        context = ordered.longest_context(self.config.context)
+        corrected = corrected_scores(self.network, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
+        success = self.dataset.rows.success[ordered.rows]
+        # Without a try nothing is corrected, and nothing could be learnt.
+        return correction_loss(corrected[..., 1:], success[..., None], ordered.asked(context)[:, 1:].transpose(1, 2))
+
+
+def corrected_scores(
+    network: Where2ActAdaptation, dataset: Dataset, prior: FrozenPrior, asked: Tensor, tries: Tensor
+) -> Tensor:
+    """Where2Act's scores of rows, corrected by every prefix of ordered tries; beyond [0, 1] where these add up.
+
+    Args:
+        network: the similarities.
+        dataset: the rows.
+        prior: what Where2Act makes of them.
+        asked: rows, [B, n].
+        tries: rows, [B, K].
+
+    Returns:
+        [B, n, K + 1], from no tries to all of them.
+    """
+    rows = dataset.rows
+    distances = (rows.xyz[asked][:, :, None] - rows.xyz[tries][:, None]).norm(dim=-1)
+    similarities = network.similarities(prior.features[tries][:, None], prior.features[asked][:, :, None], distances)
+    added = influences(similarities, rows.success[tries], prior.scores[tries]).cumsum(dim=-1)
+    before = prior.scores[asked][..., None]
+    return torch.cat([before, before + added], dim=-1)
