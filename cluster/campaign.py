@@ -3,6 +3,7 @@
     objects, collect-random, train-prior,
     train-aap-1, train-aip-1, publish-1,
     collect-aip-1, train-aap-2, train-aip-2, publish-2, ...
+    (before the last publication train-where2act-interaction, train-where2act-adaptation, where they are evaluated)
     evaluate, report
 
 The same live workers serve every collection round; each round's policy reaches them by version.
@@ -29,6 +30,7 @@ from cluster.stages import Stage, run_stages
 from cluster.training import Trainer
 from shared.errors import UsageError
 from shared.files import write_atomically
+from shared.methods import baselines_of, versions_of
 from shared.plan import Plan, Setting
 from shared.store import Store
 from shared.tasks import task_named
@@ -89,7 +91,8 @@ class Campaign:
             Stage("collect-random", partial(self._collect, crew, "random", 0, self._config.rollouts.random)),
             Stage("train-prior", trainer.prior),
         ]
-        for version in range(1, self._config.alternations + 2):
+        final = self._config.alternations + 1
+        for version in range(1, final + 1):
             if version > 1:
                 count = self._config.rollouts.aip
                 stages.append(
@@ -98,9 +101,12 @@ class Campaign:
             stages += [
                 Stage(f"train-aap-{version}", partial(trainer.aap, version)),
                 Stage(f"train-aip-{version}", partial(trainer.aip, version)),
-                Stage(f"publish-{version}", partial(trainer.publish, version)),
             ]
-        final = self._config.alternations + 1
+            last = f"aip-{version}"
+            for name in baselines_of(self._config.evaluation.methods) if version == final else ():
+                stages.append(Stage(f"train-{name}", partial(trainer.baseline, name, last)))
+                last = name
+            stages.append(Stage(f"publish-{version}", partial(trainer.publish, version, last)))
         return [*stages, Stage("evaluate", partial(self._evaluate, crew, final)), Stage("report", self._report)]
 
     def _choose_objects(self) -> Mapping[str, Any]:
@@ -149,7 +155,8 @@ class Campaign:
     def _evaluate(self, crew: Crew, version: int) -> Mapping[str, Any]:
         """Try every method on unseen objects with the last policy, then ask the critics about the rest."""
         evaluation = Store.open(self._run.evaluation)
-        evaluation.publish_policy(version, Store.open(self._run.store).read_policy(version))
+        for used in versions_of(self._config.evaluation.methods, version):
+            evaluation.publish_policy(used, Store.open(self._run.store).read_policy(used))
         collected = self._fill(crew, self._run.evaluation, "evaluation", version, self._config.rollouts.evaluation)
         crew.dismiss()
         return collected | dict(self._trainer.evaluate(version))

@@ -5,7 +5,7 @@ from pathlib import Path
 from pydantic import Field, field_validator, model_validator
 
 from cluster.selection import ObjectSelection
-from learner.configuration import AapConfig, AipConfig, PriorConfig
+from learner.configuration import AapConfig, AdaptationConfig, AipConfig, InteractionConfig, PriorConfig
 from shared.configuration import CollectionConfig, StrictModel
 from shared.networks.configuration import NetworkConfig
 from shared.plan import EvaluationConfig
@@ -78,6 +78,8 @@ class LearnerSettings(StrictModel):
     prior: PriorConfig = PriorConfig()
     aap: AapConfig = AapConfig()
     aip: AipConfig = AipConfig()
+    interaction: InteractionConfig = InteractionConfig()
+    adaptation: AdaptationConfig = AdaptationConfig()
 
 
 class CampaignConfig(ObjectSelection):

@@ -1,6 +1,7 @@
-"""Judges a policy on an evaluation store: `python -m cluster.judging STORE VERSION OUT`, a process of its own.
+"""Judges a policy on an evaluation store: `python -m cluster.judging STORE VERSION OUT AAP`, a process of its own.
 
-Like a learner it shares a process with neither Ray nor SAPIEN.
+AAP is the folder of the training stage that may have left an oracle. Like a learner it shares a process with neither
+Ray nor SAPIEN.
 """
 
 import json
@@ -11,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from learner.evaluation import PRIOR_METHOD, EvaluationRow, evaluate_store
+from learner.oracle import read_oracle
+from learner.recipes import ORACLE_FILE
 from shared.errors import AdaAffordError
 from shared.files import write_atomically
 from shared.policy import Policy
@@ -22,9 +25,9 @@ RESULTS_FILE = "results.json"
 
 def main(arguments: list[str]) -> int:
     """Write OUT/results.json; returns the exit code."""
-    store, version, out = Path(arguments[0]), int(arguments[1]), Path(arguments[2])
+    store, version, out, aap = Path(arguments[0]), int(arguments[1]), Path(arguments[2]), Path(arguments[3])
     try:
-        rows = judge(Store.open(store), version)
+        rows = judge(Store.open(store), version, aap / ORACLE_FILE)
         write_atomically(out / RESULTS_FILE, json.dumps({"rows": rows}, indent=1, allow_nan=False).encode())
     except AdaAffordError as error:
         print(error, file=sys.stderr)
@@ -32,13 +35,20 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def judge(store: Store, version: int) -> list[dict[str, Any]]:
-    """The rows of summary.json, a method and a budget each."""
+def judge(store: Store, version: int, oracle: Path) -> list[dict[str, Any]]:
+    """The rows of summary.json, a method and a budget each.
+
+    Args:
+        store: the evaluation store.
+        version: the policy.
+        oracle: file of the oracle's weights; where AAP was trained without one, there is none.
+    """
     config = store.setting.evaluation
     assert config is not None, "an evaluation store says what was evaluated"
-    policy = Policy.from_files(store.read_policy(version))
+    network = Policy.from_files(store.read_policy(version)).config
+    told = read_oracle(oracle, network) if oracle.is_file() else None
     rows = []
-    for row in evaluate_store(store, policy, sorted(config.budgets)):
+    for row in evaluate_store(store, version, sorted(config.budgets), told):
         rows += _each_budget(row, store, sorted(config.budgets)) if row.method == PRIOR_METHOD else [row]
     return [_plain(row) for row in rows]
 

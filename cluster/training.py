@@ -13,6 +13,7 @@ from cluster.run_folder import RunFolder
 from learner.configuration import LearnerConfig
 from shared.errors import UsageError, WorkerError
 from shared.files import read_bounded, write_atomically
+from shared.methods import BaselineName
 from shared.plan import ObjectRef
 from shared.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
 from shared.store import Store
@@ -28,6 +29,8 @@ class Trainer:
     """The training stages of one run; each starts from what the last one left, and leaves a whole policy.
 
     prior -> aap-1 -> aip-1 (published as 1) -> aap-2 -> aip-2 (published as 2) -> ...
+
+    Baselines that the evaluation wants are trained before the last publication.
     """
 
     def __init__(self, run: RunFolder, config: CampaignConfig, say: Callable[[str], None]) -> None:
@@ -47,9 +50,13 @@ class Trainer:
         """AIP, for the AAP of the same version."""
         return self._train("aip", f"aip-{version}", f"aap-{version}")
 
-    def publish(self, version: int) -> Mapping[str, Any]:
-        """Put the policy into the store, where collectors find it."""
-        folder = self._run.training(f"aip-{version}")
+    def baseline(self, name: BaselineName, after: str) -> Mapping[str, Any]:
+        """A learnt baseline, added to the policy that the stage `after` left."""
+        return self._train(name, name, after)
+
+    def publish(self, version: int, after: str) -> Mapping[str, Any]:
+        """Put the policy that the stage `after` left into the store, where collectors find it."""
+        folder = self._run.training(after)
         files = {name: read_bounded(folder / name, MAX_WEIGHTS_BYTES) for name in (WEIGHTS_FILE, POLICY_FILE)}
         Store.open(self._run.store).publish_policy(version, files)
         self._say(f"published policy {version}, {sum(map(len, files.values())) / 1e6:.1f} MB")
@@ -58,7 +65,8 @@ class Trainer:
     def evaluate(self, version: int) -> Mapping[str, Any]:
         """Judge the policy by what was tried on unseen objects."""
         out = self._run.training("evaluate")
-        run_child("cluster.judging", [str(self._run.evaluation), str(version), str(out)], out, self._say)
+        arguments = [str(self._run.evaluation), str(version), str(out), str(self._run.training("aap-1"))]
+        run_child("cluster.judging", arguments, out, self._say)
         return {"policy": version}
 
     def _train(self, network: str, stage: str, init: str | None) -> dict[str, Any]:

@@ -4,7 +4,7 @@ An evaluation store holds, for each rollout, random QUERY rows that critics are 
 rows, its tries in order; and for each method and budget, EXPLOIT rows, what the adapted affordance then chose.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from learner.critics import OracleScores, RowCritic, row_critic
 from learner.data import Dataset, load_dataset
 from learner.metrics import discrimination
-from learner.sampling import frozen_features
+from learner.oracle import OracleCritic
 from shared.errors import StoreError
+from shared.methods import METHODS, CriticName, method_named
 from shared.policy import Policy
 from shared.store.store import Store
 from shared.vocabulary import Role
@@ -23,6 +25,8 @@ from shared.vocabulary import Role
 PRIOR_METHOD = "where2act"
 NO_TRIES_METHOD = "aap-no-tries"
 """AAP before any try: a second, often stronger, prior to compare with."""
+ORACLE_METHOD = "oracle"
+"""A critic that is told the hidden facts: the bound of what tries can teach. It acts on nothing, so has no exploits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,56 +62,103 @@ class EvaluationRow:
     mean_tries: float
 
 
-def evaluate_store(store: Store, policy: Policy, budgets: Sequence[int]) -> list[EvaluationRow]:
-    """Evaluate a policy on an evaluation store.
+def evaluate_store(
+    store: Store, version: int, budgets: Sequence[int], oracle: OracleCritic | None = None
+) -> list[EvaluationRow]:
+    """Evaluate a policy version on an evaluation store that holds it, and what its methods did with others.
+
+    Args:
+        store: the evaluation store.
+        version: which policy.
+        budgets: numbers of tries.
+        oracle: to judge beside it.
 
     Raises:
-        StoreError: the store is of another task, is damaged, or holds no QUERY row.
+        StoreError: the store is damaged, holds no QUERY row, or lacks a policy that a method used.
     """
-    if store.setting.task != policy.task:
-        raise StoreError(f"{store.path}: is of task '{store.setting.task}', but the policy of '{policy.task}'")
-    return evaluate(load_dataset(store, policy.config), policy, budgets)
+    policies = {version: Policy.from_files(store.read_policy(version))}
+    dataset = load_dataset(store, policies[version].config)
+    for method in _methods(dataset):
+        used = method_named(method).policy_version(version)
+        if used not in policies:
+            policies[used] = Policy.from_files(store.read_policy(used))
+    return evaluate(dataset, policies, version, budgets, oracle)
 
 
-def evaluate(dataset: Dataset, policy: Policy, budgets: Sequence[int]) -> list[EvaluationRow]:
-    """One row for each method and budget; Where2Act and AAP with no tries first, at budget 0.
+def evaluate(
+    dataset: Dataset,
+    policies: Mapping[int, Policy],
+    version: int,
+    budgets: Sequence[int],
+    oracle: OracleCritic | None = None,
+) -> list[EvaluationRow]:
+    """One row for each method and budget that there are rows of.
+
+    Where2Act, AAP with no tries and the oracle, where there is one, have a row of their own at budget 0.
+
+    Args:
+        dataset: the interactions.
+        policies: that methods used, by version.
+        version: the policy that is evaluated.
+        budgets: numbers of tries.
+        oracle: a critic that is told the hidden facts.
 
     Raises:
-        StoreError: there is no QUERY row.
+        StoreError: there is no QUERY row, or the data set is of another task than a policy.
     """
-    policy.modules().eval()
-    judge = _Judge(dataset, policy)
-    adapted = sorted(set(dataset.rows.method.tolist()) - {"", PRIOR_METHOD, NO_TRIES_METHOD})
-    return [
-        judge.row(PRIOR_METHOD, 0),
-        judge.row(NO_TRIES_METHOD, 0),
-        *(judge.row(method, budget) for method in adapted for budget in budgets),
+    for policy in policies.values():
+        if policy.task != dataset.task:
+            raise StoreError(f"the store is of task '{dataset.task}', but a policy of '{policy.task}'")
+        policy.modules().eval()
+    judge = _Judge(dataset, policies)
+    rows = [
+        judge.row(PRIOR_METHOD, 0, judge.critic("where2act", version)),
+        judge.row(NO_TRIES_METHOD, 0, judge.critic("aap", version)),
     ]
+    if oracle is not None:
+        rows.append(judge.row(ORACLE_METHOD, 0, OracleScores(oracle.eval(), dataset)))
+    for name in _methods(dataset):
+        method = method_named(name)
+        critic = judge.critic(method.critic, method.policy_version(version))
+        rows += [judge.row(name, budget, critic) for budget in method.budgets(budgets)]
+    return rows
+
+
+def _methods(dataset: Dataset) -> list[str]:
+    """Methods that made tries, in the order of the paper's table.
+
+    Raises:
+        StoreError: a row is of a method that there is not.
+    """
+    found = set(dataset.rows.method.tolist()) - {""}
+    unknown = sorted(found - METHODS.keys())
+    if unknown:
+        raise StoreError(f"the store holds rows of method '{unknown[0][:40]}'; known: {', '.join(METHODS)}")
+    return [name for name in METHODS if name in found and name != PRIOR_METHOD]
 
 
 class _Judge:
-    """Scores of the query rows under any context, with everything that does not depend on it computed once."""
+    """Figures of critics on the query rows after what a method tried."""
 
-    def __init__(self, dataset: Dataset, policy: Policy) -> None:
+    def __init__(self, dataset: Dataset, policies: Mapping[int, Policy]) -> None:
         rows = dataset.rows
-        self.dataset, self.policy = dataset, policy
+        self.dataset, self.policies = dataset, policies
         self.queries = [index[rows.role[index.numpy()] == Role.QUERY.value] for index in dataset.rollouts]
         if not sum(map(len, self.queries)):
             raise StoreError("the store holds no query to judge by; evaluate on a store made by an evaluation plan")
-        self.features = frozen_features(policy.aap.encoder, dataset.clouds, rows.cloud, rows.point)
-        with torch.no_grad():
-            self.codes, self.weights = policy.aap.interaction_codes(
-                self.features, rows.xyz, rows.frame, rows.motion, rows.success
-            )
+        self._critics: dict[tuple[CriticName, int], RowCritic] = {}
 
-    def row(self, method: str, budget: int) -> EvaluationRow:
+    def critic(self, name: CriticName, version: int) -> RowCritic:
+        """A critic of a policy, made once for all methods that share it."""
+        if (name, version) not in self._critics:
+            self._critics[name, version] = row_critic(name, self.policies[version], self.dataset)
+        return self._critics[name, version]
+
+    def row(self, method: str, budget: int, critic: RowCritic) -> EvaluationRow:
         """The figures of a method at a budget."""
         contexts = [self._context(index, method, budget) for index in self.dataset.rollouts]
         pairs = [pair for pair in zip(self.queries, contexts, strict=True) if len(pair[0])]
-        scores = [
-            self._prior_scores(queries) if method == PRIOR_METHOD else self._adapted_scores(queries, context)
-            for queries, context in pairs
-        ]
+        scores = [critic(queries, context) for queries, context in pairs]
         successes = self.dataset.rows.success[torch.cat([queries for queries, _ in pairs])]
         found = discrimination(torch.cat(scores).numpy(), successes.numpy())
         exploits = self._exploits(method, budget)
@@ -135,19 +186,6 @@ class _Judge:
         """Outcomes of the exploits; those of a prior count whatever budget they are listed under."""
         rows = self.dataset.rows
         chosen = (rows.role == Role.EXPLOIT.value) & (rows.method == method)
-        if method not in (PRIOR_METHOD, NO_TRIES_METHOD):
+        if method != PRIOR_METHOD:
             chosen &= rows.budget == budget
         return np.asarray(rows.success.numpy()[chosen], dtype=np.float32)
-
-    @torch.no_grad()
-    def _adapted_scores(self, queries: Tensor, context: Tensor) -> Tensor:
-        rows, aap = self.dataset.rows, self.policy.aap
-        latent = aap.latent(self.codes[context], self.weights[context])
-        logits = aap.action_logits(self.features[queries], rows.xyz[queries], rows.frame[queries], latent)
-        return torch.sigmoid(logits)
-
-    @torch.no_grad()
-    def _prior_scores(self, queries: Tensor) -> Tensor:
-        rows, prior = self.dataset.rows, self.policy.prior
-        features = frozen_features(prior.encoder, self.dataset.clouds, rows.cloud[queries], rows.point[queries])
-        return torch.sigmoid(prior.action_logits(features, rows.xyz[queries], rows.frame[queries]))

@@ -1,10 +1,16 @@
 """The oracle critic: AAP's critic with z told outright; the upper bound of adaptation, and a teacher."""
 
+from pathlib import Path
+
+import torch
 from torch import Tensor, nn
 
 from learner.facts import FACTS_WIDTH
 from learner.sampling import Batch
+from shared.files import read_bounded
 from shared.networks.aap import Aap, OracleEncoder
+from shared.networks.configuration import NetworkConfig
+from shared.policy import MAX_WEIGHTS_BYTES, check_tensors, read_tensors
 
 
 class OracleCritic(nn.Module):
@@ -27,3 +33,17 @@ class OracleCritic(nn.Module):
         """Logits of the rows' scores, [B, n]."""
         features = batch.features(self.aap.encoder)
         return self.aap.action_logits(features, batch.xyz, batch.frame, self.oracle(batch.facts))
+
+
+def read_oracle(path: Path, config: NetworkConfig) -> OracleCritic:
+    """The oracle that the training of AAP left in a file, trusting nothing.
+
+    Raises:
+        StoreError: the file is damaged, foreign, or of networks of another size.
+    """
+    tensors = read_tensors(read_bounded(path, MAX_WEIGHTS_BYTES), str(path))
+    with torch.device("meta"):
+        oracle = OracleCritic(Aap(config))
+    check_tensors(tensors, oracle.state_dict(), str(path))
+    oracle.load_state_dict(tensors, assign=True)
+    return oracle.eval().requires_grad_(False)

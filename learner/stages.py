@@ -163,7 +163,7 @@ def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Polic
     if policy.task != task:
         raise UsageError(f"{job.init}: a policy for '{policy.task}', but the store is of '{task}'; use one of its task")
     policy.require(*NEEDED[job.stage])
-    if job.stage == "where2act-interaction" or job.stage == "where2act-adaptation":
+    if job.stage in ("where2act-interaction", "where2act-adaptation"):
         policy.begin_baseline(job.stage, torch_seed(config.seed, f"learner.{job.stage}.weights") % 2**32)
     return policy
 

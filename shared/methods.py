@@ -5,11 +5,13 @@ They share one loop and differ in one thing each (AdaAfford, Baselines and Ablat
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from shared.errors import UsageError
 
-CriticName = Literal["where2act", "aap", "where2act-interaction", "where2act-adaptation"]
+BaselineName = Literal["where2act-interaction", "where2act-adaptation"]
+"""Baselines with a network of their own, which are trained only where they are wanted."""
+CriticName = Literal["where2act", "aap", BaselineName]
 TriesName = Literal["random", "aip", "fps", "purefps", "argfps", "where2act-fps"]
 
 FIRST_VERSION = 1
@@ -63,3 +65,14 @@ def method_named(name: str) -> Method:
     if name not in METHODS:
         raise UsageError(f"unknown method '{name}'; allowed: {', '.join(METHODS)}")
     return METHODS[name]
+
+
+def baselines_of(methods: Sequence[str]) -> list[BaselineName]:
+    """The networks of their own that methods need, each once."""
+    wanted = {METHODS[name].critic for name in methods}
+    return [name for name in get_args(BaselineName) if name in wanted]
+
+
+def versions_of(methods: Sequence[str], evaluated: int) -> list[int]:
+    """The policy versions that methods use where version `evaluated` is evaluated, which is one of them."""
+    return sorted({METHODS[name].policy_version(evaluated) for name in methods} | {evaluated})

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from shared.configuration import StrictModel
 from shared.errors import StoreError, UsageError
+from shared.methods import BaselineName
 from shared.networks.aap import Aap
 from shared.networks.aip import Aip
 from shared.networks.configuration import NetworkConfig
@@ -25,7 +26,6 @@ POLICY_SCHEMA = 1
 MAX_POLICY_JSON_BYTES = 1 << 16
 MAX_WEIGHTS_BYTES = 1 << 30
 
-BaselineName = Literal["where2act-interaction", "where2act-adaptation"]
 ModuleName = Literal["prior", "aap", "aip", BaselineName]
 
 

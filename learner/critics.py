@@ -1,0 +1,113 @@
+"""Critics of a policy, asked about rows of a data set instead of what a camera sees (compare `shared.critics`).
+
+What does not depend on the tries is computed once for all rows. Shapes: Q rows asked about, K tries.
+"""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from learner.data import Dataset
+from learner.frozen import FrozenPrior
+from learner.oracle import OracleCritic
+from learner.sampling import frozen_features
+from learner.where2act_adaptation import corrected_scores
+from shared.methods import CriticName
+from shared.networks.aap import Aap
+from shared.networks.where2act_adaptation import Where2ActAdaptation
+from shared.policy import Policy
+
+
+class RowCritic(Protocol):
+    """What a method believes of rows after tries of the same rollout."""
+
+    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
+        """Scores in [0, 1] of rows, [Q], after the rows `tries`, [K], of which there may be none; [Q]."""
+        ...
+
+
+def row_critic(name: CriticName, policy: Policy, dataset: Dataset) -> RowCritic:
+    """The critic of a policy that is called `name`.
+
+    Raises:
+        UsageError: its network is not trained.
+    """
+    match name:
+        case "where2act":
+            return PriorScores(FrozenPrior.of(policy.prior, dataset))
+        case "aap":
+            return AdaptiveScores(policy.aap, dataset)
+        case "where2act-interaction":
+            policy.require(name)
+            assert policy.where2act_interaction is not None, "a trained module is there"
+            return AdaptiveScores(policy.where2act_interaction, dataset)
+        case "where2act-adaptation":
+            policy.require(name)
+            assert policy.where2act_adaptation is not None, "a trained module is there"
+            return CorrectedScores(policy.where2act_adaptation, FrozenPrior.of(policy.prior, dataset), dataset)
+
+
+class PriorScores:
+    """Where2Act, which knows nothing of tries."""
+
+    def __init__(self, prior: FrozenPrior) -> None:
+        self._prior = prior
+
+    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
+        """Where2Act's scores."""
+        return self._prior.scores[asked]
+
+
+class AdaptiveScores:
+    """AAP, or Where2Act-interaction, which shares its form."""
+
+    @torch.no_grad()
+    def __init__(self, aap: Aap, dataset: Dataset) -> None:
+        self._aap, self._rows = aap, dataset.rows
+        rows = dataset.rows
+        self._features = frozen_features(aap.encoder, dataset.clouds, rows.cloud, rows.point)
+        self._codes, self._weights = aap.interaction_codes(
+            self._features, rows.xyz, rows.frame, rows.motion, rows.success
+        )
+
+    @torch.no_grad()
+    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
+        """s_u|z."""
+        latent = self._aap.latent(self._codes[tries], self._weights[tries])
+        return torch.sigmoid(
+            self._aap.action_logits(self._features[asked], self._rows.xyz[asked], self._rows.frame[asked], latent)
+        )
+
+
+class CorrectedScores:
+    """Where2Act-adaptation."""
+
+    def __init__(self, network: Where2ActAdaptation, prior: FrozenPrior, dataset: Dataset) -> None:
+        self._network, self._prior, self._dataset = network, prior, dataset
+
+    @torch.no_grad()
+    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
+        """s_u + sum (r - s) sim_pq, cut to [0, 1]."""
+        if not len(tries):
+            return self._prior.scores[asked]
+        corrected = corrected_scores(self._network, self._dataset, self._prior, asked[None], tries[None])
+        return corrected[0, :, -1].clamp(0.0, 1.0)
+
+
+class OracleScores:
+    """The oracle critic, which is told the hidden facts and needs no tries."""
+
+    def __init__(self, oracle: OracleCritic, dataset: Dataset) -> None:
+        self._oracle, self._rows = oracle, dataset.rows
+        self._features = frozen_features(oracle.aap.encoder, dataset.clouds, dataset.rows.cloud, dataset.rows.point)
+
+    @torch.no_grad()
+    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
+        """s_u with z = h(hidden facts)."""
+        latents = self._oracle.oracle(self._rows.facts[asked])
+        return torch.sigmoid(
+            self._oracle.aap.action_logits(
+                self._features[asked], self._rows.xyz[asked], self._rows.frame[asked], latents
+            )
+        )
