@@ -44,11 +44,12 @@ class Crew:
         self._fleet: Fleet | None = None
         self._of: tuple[Path, Path] | None = None
 
-    def for_store(self, store: Path, objects: Path) -> Fleet:
+    def for_store(self, store: Store, objects: Path) -> Fleet:
         """The fleet whose workers write to `store`."""
-        if self._fleet is None or self._of != (store, objects):
+        if self._fleet is None or self._of != (store.path, objects):
             self.dismiss()
-            self._fleet, self._of = self._make_fleet(partial(make_worker, store, objects)), (store, objects)
+            self._fleet = self._make_fleet(partial(make_worker, store.path, objects), store.underway)
+            self._of = store.path, objects
         return self._fleet
 
     def dismiss(self) -> None:
@@ -77,7 +78,7 @@ class Campaign:
         with only_driver(self._run.path):
             ledger = Ledger(self._run.log)
             ledger.note("attempt", workers=config.workers)
-            with fleets(config.workers, config.job_limit_s, config.ray_address) as make_fleet:
+            with fleets(config.workers, config.limits, config.ray_address) as make_fleet:
                 run_stages(self.stages(Crew(make_fleet)), ledger, self._say)
             from cluster.report import print_report
 
@@ -163,10 +164,9 @@ class Campaign:
 
     def _fill(self, crew: Crew, path: Path, proposer: str, version: int, rollouts: int) -> dict[str, Any]:
         store, used = Store.open(path), self._run.objects_used()
-        store.sweep()
         plan = Plan(setting=store.setting, proposer=proposer, policy_version=version)
         folder = Path(used.folder)
-        open_fleet = partial(crew.for_store, path, folder)
+        open_fleet = partial(crew.for_store, store, folder)
         with only_driver(path):
             collected = collect(store, plan, rollouts, self._config.rollouts.per_shard, open_fleet, folder)
         return _figures(collected)

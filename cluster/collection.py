@@ -1,16 +1,24 @@
 """Drives one plan over a fleet: what is committed stays, what is missing is done, and nothing is done twice."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cluster.fleet import Fleet, JobError
+from cluster.blame import JobError
+from cluster.fleet import Fleet
 from cluster.progress import CollectionProgress, Tally
 from shared.errors import WorkerError
-from shared.plan import Job, Plan, missing_jobs
+from shared.plan import Plan, missing_jobs
+from shared.reproduction import reproduction
 from shared.store import Store
 
 OpenFleet = Callable[[], Fleet]
+
+MOST_REPORTED = 10
+"""Quarantined rollouts that a collection prints; a store that is all wrong would print thousands."""
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +46,8 @@ def collect(store: Store, plan: Plan, rollouts: int, per_shard: int, open_fleet:
         WorkerError: a job failed again and again; the message ends with the command that reproduces it.
         StoreError: the plan's policy is not in the store.
     """
+    # Only one driver works on a store, so whatever the dead left is of no use to anybody.
+    store.sweep()
     store.add_plan(plan)
     done = [(shard.start, shard.stop) for shard in store.committed(plan.key)]
     jobs = missing_jobs(plan.key, rollouts, done, per_shard)
@@ -52,11 +62,16 @@ def collect(store: Store, plan: Plan, rollouts: int, per_shard: int, open_fleet:
         try:
             fleet.run(plan, jobs, progress)
         except JobError as error:
-            command = reproduction(store.path, error.job, objects)
+            command = reproduction(store.path, error.job.shard_id, objects)
             raise WorkerError(f"{error}; reproduce it with: {command}") from None
+    if progress.tally.quarantined:
+        _report_quarantined(store, plan)
     return Collected(progress.tally, progress.elapsed_s, fleet.workers)
 
 
-def reproduction(store: Path, job: Job, objects: Path) -> str:
-    """The command that runs one job alone, in the foreground, without Ray."""
-    return f"adaafford store replay {store} {job.shard_id} --objects {objects}"
+def _report_quarantined(store: Store, plan: Plan) -> None:
+    """Say which rollouts were given up, why, and how to see it happen."""
+    given_up = [each for shard in store.committed(plan.key) for each in shard.quarantined]
+    logger.warning("%d rollouts of %s are quarantined; `adaafford store info` lists them", len(given_up), plan.key)
+    for each in given_up[:MOST_REPORTED]:
+        logger.warning("rollout %d: %s; alone: %s", each.rollout, each.reason, each.command)

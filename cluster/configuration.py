@@ -5,12 +5,13 @@ from pathlib import Path
 from pydantic import Field, field_validator, model_validator
 
 from cluster.selection import ObjectSelection
+from collector.guard import Limits
 from learner.configuration import AapConfig, AdaptationConfig, AipConfig, InteractionConfig, PriorConfig
 from shared.configuration import CollectionConfig, StrictModel
 from shared.networks.configuration import NetworkConfig
 from shared.plan import EvaluationConfig
 
-EXECUTION_SETTINGS = frozenset({"workers", "ray_address", "job_limit_s"})
+EXECUTION_SETTINGS = frozenset({"workers", "ray_address", "rollout_limit_s", "memory_limit_mb"})
 """Settings that do not change what a run produces; they may differ from one attempt to the next."""
 
 
@@ -101,5 +102,13 @@ class CampaignConfig(ObjectSelection):
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""
     ray_address: str | None = None
     """Of a running Ray cluster; a private session on this machine where none is given."""
-    job_limit_s: float = Field(300.0, gt=0)
-    """A worker that takes longer for one job is taken for hung, and replaced."""
+    rollout_limit_s: float = Field(300.0, gt=0)
+    """A worker that takes longer for one rollout is taken for hung, and replaced; after three times the rollout is
+    quarantined."""
+    memory_limit_mb: float = Field(2000.0, gt=0)
+    """What a worker may take beyond what it had after its start; at half of that it is replaced after its job."""
+
+    @property
+    def limits(self) -> Limits:
+        """Of a worker's process."""
+        return Limits(self.rollout_limit_s, self.memory_limit_mb)

@@ -13,14 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from shared.errors import AdaAffordError, WorkerError
+from cluster.blame import Blame, Failure, describe
+from collector.guard import UnderWay
+from shared.errors import AdaAffordError
 from shared.plan import Job, Plan
 
 if TYPE_CHECKING:
     from collector.worker import Receipt
-
-MAX_ATTEMPTS = 3
-"""How often a job is tried before the run ends: once for its own sake, twice against bad luck of a machine."""
 
 logger = logging.getLogger(__name__)
 
@@ -32,8 +31,8 @@ class Worker(Protocol):
         """Make the policy `version` ready for plans that use it."""
         ...
 
-    def run(self, plan: Plan, job: Job) -> "Receipt":
-        """Execute and commit `job`; do nothing if that was done before."""
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> "Receipt":
+        """Execute and commit `job`; do nothing if that was done before. See `collector.worker.Worker.run`."""
         ...
 
 
@@ -51,20 +50,6 @@ def make_worker(store: Path, objects: Path) -> Worker:
     return Collector(store, objects)
 
 
-class JobError(WorkerError):
-    """A job failed as often as it may.
-
-    Attributes:
-        job: the job.
-        reason: how it failed last, one line.
-    """
-
-    def __init__(self, job: Job, reason: str) -> None:
-        super().__init__(f"job {job.shard_id} failed {MAX_ATTEMPTS} times; last: {reason}")
-        self.job = job
-        self.reason = reason
-
-
 class Fleet(Protocol):
     """Executes jobs on some number of workers."""
 
@@ -78,8 +63,10 @@ class Fleet(Protocol):
     def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[["Receipt"], None]) -> None:
         """Execute `jobs`, in any order, and report each once.
 
+        A rollout that fails again and again is given up and recorded as quarantined; see `cluster.blame`.
+
         Raises:
-            JobError: a job failed `MAX_ATTEMPTS` times for reasons of infrastructure.
+            JobError: a job failed again and again, and no rollout of it was to blame.
             AdaAffordError: a worker met a problem that the user must solve; it is not tried again.
         """
         ...
@@ -90,7 +77,11 @@ class Fleet(Protocol):
 
 
 class SerialFleet:
-    """One worker in this very process, without Ray: the same code for debugging, tests and tiny machines."""
+    """One worker in this very process, without Ray: the same code for debugging, tests and tiny machines.
+
+    Rollouts that raise are quarantined as everywhere. One that crashes ends this process, and one that hangs is waited
+    for, as in any program that is debugged; a fleet of processes survives both.
+    """
 
     workers = 1
 
@@ -107,26 +98,26 @@ class SerialFleet:
 
     def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[["Receipt"], None]) -> None:
         """See `Fleet.run`."""
+        blame = Blame()
         for job in jobs:
-            on_receipt(self._run_stubbornly(plan, job))
+            on_receipt(self._run_stubbornly(plan, job, blame))
 
     def close(self) -> None:
         """See `Fleet.close`."""
         self._worker = None
 
-    def _run_stubbornly(self, plan: Plan, job: Job) -> "Receipt":
-        """Try `job` with a fresh worker after each failure."""
-        reason = ""
-        for _ in range(MAX_ATTEMPTS):
+    def _run_stubbornly(self, plan: Plan, job: Job, blame: Blame) -> "Receipt":
+        """Try `job`, with a fresh worker after each failure, until it is done or no rollout is to blame."""
+        while True:
+            rollouts: list[int | None] = [None]
             try:
-                return self._live_worker().run(plan, job)
+                return self._live_worker().run(plan, job, blame.quarantined(job), rollouts.append)
             except AdaAffordError:
                 raise
             except Exception as error:
-                logger.warning("job %s failed", job.shard_id, exc_info=True)
+                logger.info("job %s failed", job.shard_id, exc_info=True)
                 self._worker = None
-                reason = describe(error)
-        raise JobError(job, reason)
+                blame.charge(job, Failure(describe(error), rollouts[-1], fault=True))
 
     def _live_worker(self) -> Worker:
         """The worker, made and given all policies if there is none yet."""
@@ -135,9 +126,3 @@ class SerialFleet:
             for version, files in self._policies.items():
                 self._worker.load_policy(version, files)
         return self._worker
-
-
-def describe(error: BaseException) -> str:
-    """An exception in one line of bounded length."""
-    text = " ".join(str(error).split())[:300]
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__

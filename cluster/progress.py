@@ -29,6 +29,10 @@ class Tally:
     outcomes: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     """Of all workers together, by stage."""
+    quarantined: int = 0
+    """Rollouts that were given up."""
+    memory_mb: float = 0.0
+    """Of the largest worker."""
 
     def add(self, receipt: "Receipt") -> None:
         """Count one receipt."""
@@ -39,6 +43,8 @@ class Tally:
             self.outcomes[name] = self.outcomes.get(name, 0) + count
         for name, seconds in receipt.seconds.items():
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        self.quarantined += receipt.quarantined
+        self.memory_mb = max(self.memory_mb, receipt.memory_mb)
 
     @property
     def success_rate(self) -> float:
@@ -103,6 +109,8 @@ class CollectionProgress:
         done = self._done + self.tally.rollouts
         rate = self.tally.interactions / self.elapsed_s
         text = f"{done}/{self._total} rollouts, {rate:.0f} interactions/s, {self.tally.success_rate:.1%} successful"
+        if self.tally.quarantined:
+            text += f", {self.tally.quarantined} quarantined"
         if self.tally.rollouts > 0 and done < self._total:
             left_s = (self._total - done) * self.elapsed_s / self.tally.rollouts
             text += f", {_minutes(left_s)} left"

@@ -2,18 +2,22 @@
 
 import logging
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import ray
-from ray.exceptions import RayActorError, RayTaskError
+from ray.exceptions import RayError, RayTaskError
 
-from cluster.fleet import MAX_ATTEMPTS, JobError, WorkerFactory, describe
+from cluster.blame import Blame, Failure, describe
+from cluster.fleet import WorkerFactory
 from collector.actor import WorkerActor
+from collector.guard import Limits
 from shared.errors import AdaAffordError
+from shared.files import end_if_here
 from shared.plan import Job, Plan
+from shared.underway import Crumb, Underway
 
 if TYPE_CHECKING:
     from collector.worker import Receipt
@@ -22,6 +26,9 @@ IN_FLIGHT = 2
 """Jobs an actor holds: one under way, one that waits so that the actor never idles for the driver's sake."""
 START_LIMIT_S = 120.0
 """An actor's process imports an engine and PyTorch, which a busy machine or a cold disk may slow; no job's fault."""
+GRACE_S = 5.0
+"""What an actor's own watchdog, which leaves a traceback, has in advance of the driver, which cannot."""
+LOST = "its process was lost without a word: killed from outside, or for want of memory"
 POLL_S = 1.0
 """How often the driver looks for hung actors when no receipt comes."""
 
@@ -35,26 +42,53 @@ class _Seat:
     actor: Any = None
     arrival: Any = None
     """What becomes ready when the actor's process is up; None from then on."""
+    process: str = ""
+    """By which name its breadcrumbs go; "" until it is up."""
     pending: deque[tuple[Any, Job]] = field(default_factory=deque)
     busy_since: float = 0.0
     """When the actor was started, or the oldest pending job came to the head; `time.monotonic`."""
+    seen: tuple[Crumb | None, float] | None = None
+    """The last breadcrumb that was looked at, and since when it has been the same."""
+    first_mb: float | None = None
+    """What the process held after its first job."""
+    retiring: bool = False
+    """Whether it is only to finish what it has."""
+
+    def settle(self) -> None:
+        """Strike out the oldest pending job; the next one comes to the head."""
+        self.pending.popleft()
+        self.busy_since, self.seen = time.monotonic(), None
+
+    def look(self, underway: Underway) -> tuple[Crumb | None, float]:
+        """The breadcrumb of the rollout under way, and since when it has been seen unchanged."""
+        crumb = underway.crumb_of(self.process)
+        if self.seen is None or self.seen[0] != crumb:
+            self.seen = crumb, time.monotonic()
+        return self.seen
+
+    def vacate(self) -> None:
+        """Forget the actor and all that was about it."""
+        self.actor = self.arrival = self.seen = self.first_mb = None
+        self.process, self.retiring = "", False
+        self.pending.clear()
 
 
 class RayFleet:
     """Actors of `collector.actor`, one CPU each, alive over all rounds. Needs a session (`cluster.session`)."""
 
-    def __init__(self, make_worker: WorkerFactory, workers: int, job_limit_s: float) -> None:
+    def __init__(self, make_worker: WorkerFactory, underway: Underway, workers: int, limits: Limits) -> None:
         """Start nothing yet: actors come up with the first jobs.
 
         Args:
             make_worker: makes the worker within an actor.
+            underway: where actors leave their breadcrumbs.
             workers: how many actors.
-            job_limit_s: an actor whose job takes longer is taken for hung. The engine holds the interpreter's lock
-                while it steps, so no watchdog within the actor could notice.
+            limits: what a rollout may take; an actor that goes beyond is ended.
         """
         self.workers = workers
         self._make_worker = make_worker
-        self._job_limit_s = job_limit_s
+        self._underway = underway
+        self._limits = limits
         self._seats = [_Seat() for _ in range(workers)]
         self._policies: dict[int, Any] = {}
 
@@ -66,16 +100,16 @@ class RayFleet:
     def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[["Receipt"], None]) -> None:
         """See `Fleet.run`."""
         waiting = deque(jobs)
-        attempts: Counter[Job] = Counter()
+        blame = Blame(self.workers)
         try:
             while waiting or any(seat.pending for seat in self._seats):
-                self._hand_out(plan, waiting)
+                self._hand_out(plan, waiting, blame)
                 # A seat whose actor is still on its way has nothing else that could be ready.
                 refs = [seat.arrival or seat.pending[0][0] for seat in self._seats if seat.pending]
-                ready, _ = ray.wait(refs, num_returns=1, timeout=min(POLL_S, self._job_limit_s / 4))
+                ready, _ = ray.wait(refs, num_returns=1, timeout=min(POLL_S, self._limits.rollout_s / 4))
                 if ready:
-                    self._take_in(ready[0], waiting, attempts, on_receipt)
-                self._replace_hung(waiting, attempts)
+                    self._take_in(ready[0], waiting, blame, on_receipt)
+                self._replace_hung(waiting, blame)
         finally:
             # Only after a failure or an interrupt is anything left; what an actor would still commit is wanted by the
             # next run anyway, but nobody would wait for it, so the actor goes.
@@ -88,83 +122,98 @@ class RayFleet:
         for seat in self._seats:
             self._dismiss(seat)
 
-    def _hand_out(self, plan: Plan, waiting: deque[Job]) -> None:
+    def _hand_out(self, plan: Plan, waiting: deque[Job], blame: Blame) -> None:
         """Give each actor up to `IN_FLIGHT` jobs; no actor gets a second one while another has none."""
         policy = self._policies.get(plan.policy_version)
         box = [] if policy is None else [policy]
+        for seat in self._seats:
+            if seat.retiring and not seat.pending:
+                self._dismiss(seat)
         for depth in range(IN_FLIGHT):
             for seat in self._seats:
                 if not waiting:
                     return
-                if len(seat.pending) == depth:
+                if len(seat.pending) == depth and not seat.retiring:
                     if seat.actor is None:
                         self._start(seat)
                     if not seat.pending:
                         seat.busy_since = time.monotonic()
                     job = waiting.popleft()
-                    seat.pending.append((seat.actor.run.remote(plan, job, box), job))
+                    ref = seat.actor.run.remote(plan, job, box, blame.quarantined(job))
+                    seat.pending.append((ref, job))
 
-    def _take_in(
-        self, ref: Any, waiting: deque[Job], attempts: Counter[Job], on_receipt: Callable[["Receipt"], None]
-    ) -> None:
+    def _take_in(self, ref: Any, waiting: deque[Job], blame: Blame, on_receipt: Callable[["Receipt"], None]) -> None:
         """Report the receipt behind `ref`, or see to the failure that it stands for."""
         seat = next(seat for seat in self._seats if seat.pending and ref in (seat.arrival, seat.pending[0][0]))
-        job = seat.pending[0][1]
         try:
-            receipt = ray.get(ref)
-        except RayActorError as error:
-            self._retry(seat, waiting, attempts, f"its process died ({describe(error)})")
-            return
+            message = ray.get(ref)
         except RayTaskError as error:
             if isinstance(error.cause, AdaAffordError):
                 raise error.cause from None
-            self._settle(seat)
-            self._count(job, attempts, describe(error.cause or error))
-            waiting.appendleft(job)
+            self._fail(seat, waiting, blame, describe(error.cause or error), fault=True)
+            return
+        except RayError as error:
+            words = self._underway.fault_of(seat.process)
+            self._fail(seat, waiting, blame, words or f"{LOST} ({type(error).__name__})", fault=bool(words))
             return
         if seat.arrival is not None:
-            seat.arrival, seat.busy_since = None, time.monotonic()
+            seat.arrival, seat.process, seat.busy_since = None, message, time.monotonic()
             return
-        self._settle(seat)
-        on_receipt(receipt)
+        seat.settle()
+        blame.acquit()
+        self._retire_if_grown(seat, message)
+        on_receipt(message)
 
-    def _replace_hung(self, waiting: deque[Job], attempts: Counter[Job]) -> None:
-        """Replace actors whose oldest job is over the limit."""
+    def _replace_hung(self, waiting: deque[Job], blame: Blame) -> None:
+        """Replace actors that hang so thoroughly that not even their own watchdog ended them.
+
+        A rollout is over its limit when the driver has seen its breadcrumb unchanged for so long by its own clock:
+        clocks of machines differ.
+        """
         for seat in self._seats:
-            limit = self._job_limit_s if seat.arrival is None else START_LIMIT_S
-            if seat.pending and time.monotonic() - seat.busy_since > limit:
-                doing = "it" if seat.arrival is None else "the start of its process"
-                self._retry(seat, waiting, attempts, f"{doing} took more than {limit:g} s")
+            if not seat.pending:
+                continue
+            if seat.arrival is not None:
+                if time.monotonic() - seat.busy_since > START_LIMIT_S:
+                    reason = f"the start of its process took more than {START_LIMIT_S:g} s"
+                    self._fail(seat, waiting, blame, reason, fault=False)
+            elif time.monotonic() - seat.busy_since > self._limits.rollout_s:
+                crumb, since = seat.look(self._underway)
+                limit = START_LIMIT_S if crumb is None else self._limits.rollout_s + GRACE_S
+                if time.monotonic() - since > limit:
+                    # A process that is stopped does not hear Ray.
+                    end_if_here(seat.process)
+                    self._fail(seat, waiting, blame, f"took more than {limit:g} s, and had to be killed", fault=True)
 
-    def _retry(self, seat: _Seat, waiting: deque[Job], attempts: Counter[Job], reason: str) -> None:
-        """Replace the seat's actor and put its jobs back in front; only the oldest one is to blame."""
+    def _retire_if_grown(self, seat: _Seat, receipt: "Receipt") -> None:
+        """Hand an actor no further jobs if its memory has grown by half of what it may grow by."""
+        if seat.first_mb is None:
+            seat.first_mb = receipt.memory_mb
+        grown_mb = receipt.memory_mb - seat.first_mb
+        if not seat.retiring and grown_mb > self._limits.memory_mb / 2:
+            logger.warning("a worker has grown by %.0f MB and is replaced", grown_mb)
+            seat.retiring = True
+
+    def _fail(self, seat: _Seat, waiting: deque[Job], blame: Blame, reason: str, *, fault: bool) -> None:
+        """Replace the seat's actor and put its jobs back in front; only what was under way is to blame."""
         jobs = [job for _, job in seat.pending]
+        crumb = self._underway.crumb_of(seat.process)
         self._dismiss(seat)
         waiting.extendleft(reversed(jobs))
-        self._count(jobs[0], attempts, reason)
-
-    def _count(self, job: Job, attempts: Counter[Job], reason: str) -> None:
-        """Count a failure of `job` and give up after `MAX_ATTEMPTS`."""
-        attempts[job] += 1
-        if attempts[job] >= MAX_ATTEMPTS:
-            raise JobError(job, reason)
-        logger.warning("job %s failed (%s); trying again", job.shard_id, reason)
+        job = next((job for job in jobs if crumb is not None and crumb.shard_id == job.shard_id), jobs[0])
+        known = crumb is not None and crumb.shard_id == job.shard_id
+        blame.charge(job, Failure(reason, crumb.rollout if known and crumb is not None else None, fault))
 
     def _start(self, seat: _Seat) -> None:
         """Seat a new actor. No restarts by Ray: those would run only `__init__` again, and lose what was in flight."""
-        seat.actor = ray.remote(num_cpus=1, max_restarts=0)(WorkerActor).remote(self._make_worker)
+        actor = ray.remote(num_cpus=1, max_restarts=0)(WorkerActor)
+        seat.actor = actor.remote(self._make_worker, self._underway, self._limits)
         seat.arrival = seat.actor.arrive.remote()
 
-    @staticmethod
-    def _settle(seat: _Seat) -> None:
-        """Strike out the oldest pending job; the next one comes to the head."""
-        seat.pending.popleft()
-        seat.busy_since = time.monotonic()
-
-    @staticmethod
-    def _dismiss(seat: _Seat) -> None:
-        """End the seat's actor and forget what it was given."""
+    def _dismiss(self, seat: _Seat) -> None:
+        """End the seat's actor and forget what it was given and what it left."""
         if seat.actor is not None:
             ray.kill(seat.actor)
-        seat.actor = seat.arrival = None
-        seat.pending.clear()
+        if seat.process:
+            self._underway.forget(seat.process)
+        seat.vacate()

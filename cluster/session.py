@@ -9,7 +9,9 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from cluster.fleet import Fleet, SerialFleet, WorkerFactory
+from collector.guard import Limits
 from shared.errors import UsageError
+from shared.underway import Underway
 
 OBJECT_STORE_BYTES = 128 << 20
 """Only weights and receipts travel, so the smallest object store that Ray likes is ample."""
@@ -24,26 +26,27 @@ _ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
 }
 
-FleetMaker = Callable[[WorkerFactory], Fleet]
+FleetMaker = Callable[[WorkerFactory, Underway], Fleet]
+"""Makes a fleet whose workers leave their breadcrumbs there."""
 
 logger = logging.getLogger(__name__)
 
 
 @contextmanager
-def fleets(workers: int, job_limit_s: float, address: str | None = None) -> Iterator[FleetMaker]:
+def fleets(workers: int, limits: Limits, address: str | None = None) -> Iterator[FleetMaker]:
     """A maker of fleets that live at most as long as the context: serial if `workers` is 0, else on Ray.
 
     Ray starts with the first fleet, so that what needs none does not wait for it.
 
     Args:
         workers: how many actors a fleet has; 0 does without Ray.
-        job_limit_s: see `cluster.ray_fleet.RayFleet`.
+        limits: what a rollout may take.
         address: of a running Ray cluster; None starts a session of our own on this machine.
     """
     with ExitStack() as stack:
         begun = False
 
-        def make(make_worker: WorkerFactory) -> Fleet:
+        def make(make_worker: WorkerFactory, underway: Underway) -> Fleet:
             nonlocal begun
             if workers == 0:
                 return SerialFleet(make_worker)
@@ -52,7 +55,7 @@ def fleets(workers: int, job_limit_s: float, address: str | None = None) -> Iter
                 begun = True
             from cluster.ray_fleet import RayFleet
 
-            fleet = RayFleet(make_worker, workers, job_limit_s)
+            fleet = RayFleet(make_worker, underway, workers, limits)
             stack.callback(fleet.close)
             return fleet
 

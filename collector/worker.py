@@ -4,27 +4,33 @@ import os
 import platform
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
+import psutil
 
 from collector.articulation import ArticulatedObject
 from collector.catalogue import load_ref
 from collector.clock import StageClock
 from collector.draws import object_of
+from collector.guard import UnderWay
 from collector.proposers import RandomProposer
-from collector.rollout import run_rollout
+from collector.rollout import quarantined_rollout, run_rollout
 from shared.adaptation import Adapter
 from shared.plan import Job, Plan
 from shared.policy import Policy
 from shared.proposers import proposer_named
-from shared.records import RolloutRecord
-from shared.store import Store
+from shared.records import RolloutRecord, RolloutStatus
+from shared.reproduction import reproduction
+from shared.store import Quarantined, Store
+from shared.store.layout import MAX_REASON
 from shared.vocabulary import Proposer
 
+NOTHING: Mapping[int, str] = MappingProxyType({})
 CACHED_OBJECTS = 16
 CACHED_POLICIES = 2
 """An evaluation may go back and forth between the last policy and the first."""
@@ -41,6 +47,8 @@ class Receipt:
         successes: likewise.
         outcomes: interactions by outcome kind.
         seconds: wall time by stage, and "total".
+        quarantined: rollouts that were not executed, since they had failed again and again.
+        memory_mb: what the worker's process held in the end.
     """
 
     shard_id: str
@@ -49,6 +57,8 @@ class Receipt:
     successes: int
     outcomes: dict[str, int]
     seconds: dict[str, float]
+    quarantined: int = 0
+    memory_mb: float = 0.0
 
 
 class Worker:
@@ -71,19 +81,53 @@ class Worker:
             self._adapters.pop(next(iter(self._adapters)))
         self._adapters[version] = Adapter(Policy.from_files(files))
 
-    def run(self, plan: Plan, job: Job) -> Receipt:
-        """Execute a job's rollouts and commit its shard; the same job again gives the same shard."""
+    def run(
+        self,
+        plan: Plan,
+        job: Job,
+        quarantined: Mapping[int, str] = NOTHING,
+        under_way: UnderWay = lambda rollout: None,
+    ) -> Receipt:
+        """Execute a job's rollouts and commit its shard; do nothing if it is committed already.
+
+        Args:
+            plan: the plan that the job belongs to.
+            job: the job.
+            quarantined: rollouts that are not to be executed, and why; they are recorded as such.
+            under_way: called with each rollout's number before it is executed, then with None.
+        """
         begun = time.perf_counter()
         clock = StageClock()
+        if self._store.holds(job):
+            return _receipt(job, self._store.read_rollouts(job.shard_id), {"total": time.perf_counter() - begun})
         records = []
         for index in range(job.start, job.stop):
-            target = self._load(plan, index, clock)
-            records.append(run_rollout(plan, index, target, partial(self._proposer, plan), clock))
+            if index in quarantined:
+                records.append(quarantined_rollout(plan, index))
+            else:
+                under_way(index)
+                records.append(self.execute(plan, index, clock))
+        under_way(None)
         provenance = {"host": platform.node(), "pid": str(os.getpid())}
         with clock.stage("write"):
-            manifest = self._store.commit(plan, job, records, provenance)
+            self._store.commit(plan, job, records, provenance, self._explain(job, quarantined))
         clock.seconds["total"] = time.perf_counter() - begun
-        return _receipt(manifest.shard_id, records, dict(clock.seconds))
+        return _receipt(job, records, dict(clock.seconds))
+
+    def execute(self, plan: Plan, index: int, clock: StageClock) -> RolloutRecord:
+        """Execute one rollout, and commit nothing."""
+        return run_rollout(plan, index, self._load(plan, index, clock), partial(self._proposer, plan), clock)
+
+    def _explain(self, job: Job, quarantined: Mapping[int, str]) -> list[Quarantined]:
+        """What the manifest says of rollouts that are not executed."""
+        return [
+            Quarantined(
+                rollout=index,
+                reason=reason[:MAX_REASON],
+                command=reproduction(self._store.path, job.shard_id, self._folder, index),
+            )
+            for index, reason in sorted(quarantined.items())
+        ]
 
     def _load(self, plan: Plan, index: int, clock: StageClock) -> ArticulatedObject:
         """The object of a rollout, as the plan knows it."""
@@ -104,13 +148,15 @@ class Worker:
         return proposer_named(name, self._adapters[version], rng, plan.most_tries)
 
 
-def _receipt(shard_id: str, records: list[RolloutRecord], seconds: dict[str, float]) -> Receipt:
+def _receipt(job: Job, records: Sequence[RolloutRecord], seconds: dict[str, float]) -> Receipt:
     outcomes = [row.outcome for record in records for row in record.interactions]
     return Receipt(
-        shard_id=shard_id,
+        shard_id=job.shard_id,
         rollouts=len(records),
         interactions=len(outcomes),
         successes=sum(outcome.success for outcome in outcomes),
         outcomes=dict(Counter(outcome.kind.value for outcome in outcomes)),
         seconds=seconds,
+        quarantined=sum(record.status is RolloutStatus.QUARANTINED for record in records),
+        memory_mb=psutil.Process().memory_info().rss / 2**20,
     )

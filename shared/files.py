@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import shutil
+import signal
 import socket
 import stat
 import time
@@ -178,6 +179,13 @@ def is_gone(process: str) -> bool:
     if match is None or match["space"] != _process_space():
         return False
     return not _is_running(int(match["pid"]), int(match["start"]))
+
+
+def end_if_here(process: str) -> None:
+    """Kill the process of this `process_name` if it is one of this host's."""
+    match = _PROCESS_NAME.fullmatch(process)
+    if match is not None and match["space"] == _process_space() and not is_gone(process):
+        os.kill(int(match["pid"]), signal.SIGKILL)
 
 
 def temporary_name(name: str) -> str:

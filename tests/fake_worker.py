@@ -1,11 +1,13 @@
 """A worker without a simulator: touches a file a shard, and misbehaves where a file in the folder says so."""
 
+import ctypes
 import os
-import time
+import signal
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from collector.guard import UnderWay
 from shared.errors import StoreError
 from shared.plan import Job, Plan
 
@@ -20,11 +22,13 @@ class FakeReceipt:
     successes: int
     outcomes: dict[str, int]
     seconds: dict[str, float]
+    quarantined: int = 0
+    memory_mb: float = 100.0
 
 
 @dataclass
 class FakeWorker:
-    """Behaviour by rollout number: files `die-N`, `raise-N`, `hang-N`, `refuse-N` hold how many more times."""
+    """Behaviour by rollout number: files `crash-N`, `die-N`, `raise-N`, `hang-N` and so on hold how many more times."""
 
     folder: Path
 
@@ -36,22 +40,46 @@ class FakeWorker:
         with (self.folder / f"pulled-{version}").open("a") as log:
             log.write(f"{os.getpid()}\n")
 
-    def run(self, plan: Plan, job: Job) -> FakeReceipt:
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> FakeReceipt:
         with (self.folder / "begun").open("a") as log:
             log.write(f"{job.shard_id} {os.getpid()}\n")
         if plan.policy_version:
             assert self._versions[plan.policy_version] == b"weights %d" % plan.policy_version
-        if self._take(f"die-{job.start}"):
-            os._exit(1)
-        if self._take(f"raise-{job.start}"):
-            raise RuntimeError("the engine\nexploded")
-        if self._take(f"hang-{job.start}"):
-            time.sleep(60)
-        if self._take(f"refuse-{job.start}"):
-            raise StoreError("the store is damaged")
+        executed = [rollout for rollout in range(job.start, job.stop) if rollout not in quarantined]
+        for rollout in executed:
+            under_way(rollout)
+            self._misbehave(rollout)
+        under_way(None)
+        for rollout, reason in quarantined.items():
+            (self.folder / f"quarantined-{rollout}").write_text(reason)
         (self.folder / f"shard-{job.shard_id}").touch()
-        rollouts = job.stop - job.start
-        return FakeReceipt(job.shard_id, rollouts, 4 * rollouts, rollouts, {"ok": 4 * rollouts}, {"total": 0.01})
+        return FakeReceipt(
+            job.shard_id,
+            job.stop - job.start,
+            4 * len(executed),
+            len(executed),
+            {"ok": 4 * len(executed)},
+            {"total": 0.01},
+            len(quarantined),
+            5000.0 if self._take(f"grow-{job.start}") else 100.0,
+        )
+
+    def _misbehave(self, rollout: int) -> None:
+        if self._take(f"crash-{rollout}"):
+            ctypes.string_at(0)
+        if self._take(f"die-{rollout}"):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self._take(f"raise-{rollout}"):
+            raise RuntimeError("the engine\nexploded")
+        if self._take(f"explode-{rollout}"):
+            bytearray(1 << 40)
+        if self._take(f"hang-{rollout}"):
+            # Unlike CDLL, PyDLL keeps the interpreter's lock, as the engine does.
+            ctypes.PyDLL(None).sleep(60)
+        if self._take(f"stop-{rollout}"):
+            os.kill(os.getpid(), signal.SIGSTOP)
+        if self._take(f"refuse-{rollout}"):
+            raise StoreError("the store is damaged")
 
     def _take(self, name: str) -> bool:
         """Whether to misbehave now."""

@@ -15,10 +15,12 @@ from cluster.fleet import Fleet, SerialFleet, WorkerFactory
 from cluster.locking import only_driver
 from cluster.progress import LINE_EVERY_S, CollectionProgress
 from cluster.run_folder import RunFolder
+from collector.guard import UnderWay
 from collector.worker import Receipt
 from shared.errors import StoreError, UsageError, WorkerError
 from shared.plan import Job, Plan
 from shared.store import Store, verify
+from shared.underway import Underway
 from tests.fabricate import fabricate_rollout, fabricate_setting
 
 OBJECTS = Path("objects")
@@ -33,7 +35,7 @@ class FabricatingWorker:
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None: ...
 
-    def run(self, plan: Plan, job: Job) -> Receipt:
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> Receipt:
         if self.breaks_at is not None and job.start <= self.breaks_at < job.stop:
             raise RuntimeError("no luck")
         records = [fabricate_rollout(plan, index) for index in range(job.start, job.stop)]
@@ -133,16 +135,17 @@ class FakeFleet:
         self.closed = True
 
 
-def test_the_same_live_fleet_serves_all_rounds_of_a_store() -> None:
+def test_the_same_live_fleet_serves_all_rounds_of_a_store(tmp_path: Path) -> None:
+    one, other = (Store.create(tmp_path / name, fabricate_setting()) for name in "ab")
     made: list[FakeFleet] = []
 
-    def make(factory: WorkerFactory) -> Fleet:
+    def make(factory: WorkerFactory, underway: Underway) -> Fleet:
         made.append(FakeFleet())
         return made[-1]
 
     crew = Crew(make)
-    assert crew.for_store(Path("a"), OBJECTS) is crew.for_store(Path("a"), OBJECTS)
-    crew.for_store(Path("b"), OBJECTS)
+    assert crew.for_store(one, OBJECTS) is crew.for_store(one, OBJECTS)
+    crew.for_store(other, OBJECTS)
     assert [fleet.closed for fleet in made] == [True, False]
 
 

@@ -66,7 +66,7 @@ def test_another_configuration_is_refused(tmp_path: Path) -> None:
 
 def test_how_many_workers_there_are_is_no_other_run(tmp_path: Path) -> None:
     run = begin(tmp_path / "run", CampaignConfig(workers=2))
-    assert begin(tmp_path / "run", CampaignConfig(workers=0, job_limit_s=1.0)) == run
+    assert begin(tmp_path / "run", CampaignConfig(workers=0, rollout_limit_s=1.0)) == run
     assert CampaignConfig.model_fields.keys() >= EXECUTION_SETTINGS
 
 

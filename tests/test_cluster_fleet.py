@@ -1,27 +1,33 @@
 """One conformance suite for both fleets, and what only the fleet of processes must bear."""
 
+import logging
 import os
+import re
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from cluster.fleet import Fleet, JobError, WorkerFactory
+from cluster.blame import MAX_FAULTS, MAX_LOSSES
+from cluster.fleet import Fleet, WorkerFactory
 from cluster.session import fleets
+from collector.guard import Limits
 from shared.configuration import CollectionConfig
 from shared.errors import StoreError
 from shared.plan import Job, ObjectRef, Plan, Setting, missing_jobs
+from shared.underway import Underway
 from tests.fake_worker import FakeReceipt, FakeWorker
 
-MakeFleet = Callable[[WorkerFactory], Fleet]
-JOB_LIMIT_S = 4.0
+MakeFleet = Callable[[WorkerFactory, Underway], Fleet]
+LIMITS = Limits(rollout_s=2.0, memory_mb=1000.0)
 
 
 @pytest.fixture(scope="module")
 def ray_fleets() -> Iterator[MakeFleet]:
-    with fleets(workers=2, job_limit_s=JOB_LIMIT_S) as make:
+    with fleets(workers=2, limits=LIMITS) as make:
         yield make
 
 
@@ -29,17 +35,17 @@ def ray_fleets() -> Iterator[MakeFleet]:
 def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
     factory = partial(FakeWorker, tmp_path)
     if request.param == "ray":
-        fleet = request.getfixturevalue("ray_fleets")(factory)
+        fleet = request.getfixturevalue("ray_fleets")(factory, Underway(tmp_path / "underway"))
         yield fleet
         fleet.close()
     else:
-        with fleets(workers=0, job_limit_s=JOB_LIMIT_S) as make:
-            yield make(factory)
+        with fleets(workers=0, limits=LIMITS) as make:
+            yield make(factory, Underway(tmp_path / "underway"))
 
 
 @pytest.fixture
 def ray_fleet(ray_fleets: MakeFleet, tmp_path: Path) -> Iterator[Fleet]:
-    fleet = ray_fleets(partial(FakeWorker, tmp_path))
+    fleet = ray_fleets(partial(FakeWorker, tmp_path), Underway(tmp_path / "underway"))
     yield fleet
     fleet.close()
 
@@ -79,11 +85,12 @@ def test_a_failure_of_infrastructure_is_tried_again(fleet: Fleet, tmp_path: Path
     assert begun(tmp_path, jobs(4)[2]) == 3
 
 
-def test_a_job_that_always_fails_ends_the_run_after_three_attempts(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_rollout_that_always_fails_is_quarantined_after_three_attempts(fleet: Fleet, tmp_path: Path) -> None:
     (tmp_path / "raise-1").write_text("99")
-    with pytest.raises(JobError, match=r"^job random-v0-00000001-00000002 failed 3 times; last: RuntimeError: .*$"):
-        run(fleet, 3)
-    assert begun(tmp_path, jobs(3)[1]) == 3
+    assert run(fleet, 3) == [job.shard_id for job in jobs(3)]
+    assert begun(tmp_path, jobs(3)[1]) == 4
+    assert (tmp_path / "quarantined-1").read_text() == "RuntimeError: the engine exploded (3 times)"
+    assert [path.name for path in tmp_path.glob("quarantined-*")] == ["quarantined-1"]
 
 
 def test_what_the_user_must_solve_is_not_tried_again(fleet: Fleet, tmp_path: Path) -> None:
@@ -124,10 +131,87 @@ def test_a_replaced_actor_pulls_the_weights_itself(ray_fleet: Fleet, tmp_path: P
     assert len(done) == 6
 
 
-def test_a_hung_actor_is_replaced(ray_fleet: Fleet, tmp_path: Path) -> None:
+def test_a_rollout_that_crashes_costs_itself_alone(ray_fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "crash-2").write_text("99")
+    wide = missing_jobs("random-v0", 8, [], 4)
+    done: list[FakeReceipt] = []
+    ray_fleet.run(plan(), wide, done.append)
+    assert sorted(receipt.shard_id for receipt in done) == [job.shard_id for job in wide]
+    assert sum(receipt.quarantined for receipt in done) == 1
+    assert begun(tmp_path, wide[0]) == 4
+    reason = (tmp_path / "quarantined-2").read_text()
+    assert re.fullmatch(
+        r"Segmentation fault, in string_at \(.*\) of _misbehave \(fake_worker.py:\d+\) \(3 times\)", reason
+    )
+
+
+def test_a_rollout_that_hangs_is_ended_with_a_traceback(ray_fleet: Fleet, tmp_path: Path) -> None:
     (tmp_path / "hang-0").write_text("1")
-    assert run(ray_fleet, 4) == [job.shard_id for job in jobs(4)]
+    with warnings_of("cluster.blame") as lines:
+        assert run(ray_fleet, 4) == [job.shard_id for job in jobs(4)]
     assert begun(tmp_path, jobs(4)[0]) == 2
+    assert re.search(r"in rollout 0 \(took more than 0:00:02, in _misbehave \(fake_worker.py:\d+\)", lines[0])
+
+
+def test_memory_that_explodes_is_bounded(ray_fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "explode-1").write_text("1")
+    with warnings_of("cluster.blame") as lines:
+        assert run(ray_fleet, 3) == [job.shard_id for job in jobs(3)]
+    assert "in rollout 1 (MemoryError" in lines[0]
+
+
+def test_an_actor_that_has_grown_is_replaced_at_no_cost(ray_fleet: Fleet, tmp_path: Path) -> None:
+    run(ray_fleet, 4)
+    before = {line.split()[1] for line in (tmp_path / "begun").read_text().splitlines()}
+    (tmp_path / "grow-2").write_text("1")
+    assert run(ray_fleet, 12) == [job.shard_id for job in jobs(12)]
+    lines = (tmp_path / "begun").read_text().splitlines()
+    after = {line.split()[1] for line in lines}
+    assert len(after) == len(before) + 1
+    assert len(lines) == 16, "no job was done twice"
+
+
+def test_nothing_is_left_of_what_was_under_way(ray_fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "crash-0").write_text("1")
+    (tmp_path / "raise-1").write_text("1")
+    run(ray_fleet, 3)
+    ray_fleet.close()
+    assert list((tmp_path / "underway").iterdir()) == []
+
+
+@pytest.mark.slow
+def test_an_actor_that_does_not_even_hear_its_watchdog_is_killed(ray_fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "stop-1").write_text("1")
+    with warnings_of("cluster.blame") as lines:
+        assert run(ray_fleet, 3) == [job.shard_id for job in jobs(3)]
+    assert "took more than 7 s, and had to be killed" in lines[0]
+
+
+@pytest.mark.slow
+def test_a_rollout_whose_process_is_always_killed_is_quarantined_at_last(ray_fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "die-1").write_text("99")
+    assert run(ray_fleet, 3) == [job.shard_id for job in jobs(3)]
+    assert begun(tmp_path, jobs(3)[1]) == MAX_LOSSES + 1
+    assert "killed from outside, or for want of memory" in (tmp_path / "quarantined-1").read_text()
+
+
+def test_processes_killed_at_random_are_no_rollouts_fault(ray_fleet: Fleet, tmp_path: Path) -> None:
+    (tmp_path / "die-1").write_text(str(MAX_FAULTS + 1))
+    assert run(ray_fleet, 3) == [job.shard_id for job in jobs(3)]
+    assert not list(tmp_path.glob("quarantined-*"))
+
+
+@contextmanager
+def warnings_of(name: str) -> Iterator[list[str]]:
+    """What a logger warns of."""
+    lines: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
+    logging.getLogger(name).addHandler(handler)
+    try:
+        yield lines
+    finally:
+        logging.getLogger(name).removeHandler(handler)
 
 
 def test_an_actor_holds_at_most_two_jobs(ray_fleet: Fleet, tmp_path: Path) -> None:

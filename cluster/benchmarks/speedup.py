@@ -13,10 +13,9 @@ from cluster.benchmarks.progress import Advance
 from cluster.fleet import make_worker
 from cluster.ray_fleet import RayFleet
 from cluster.session import ray_session
+from collector.guard import Limits
 from shared.plan import Job, Plan
 from shared.store import Store
-
-JOB_LIMIT_S = 600.0
 
 
 def speedup(plan: Plan, folder: Path, rollouts: int, repeats: int, workers: int, advance: Advance) -> dict[str, Any]:
@@ -40,7 +39,7 @@ def speedup(plan: Plan, folder: Path, rollouts: int, repeats: int, workers: int,
         stores, fleets = [], []
         for count in (1, workers):
             store = Store.create(Path(scratch) / f"store-{count}", plan.setting)
-            fleet = RayFleet(partial(make_worker, store.path, folder), count, JOB_LIMIT_S)
+            fleet = RayFleet(partial(make_worker, store.path, folder), store.underway, count, Limits())
             stack.callback(fleet.close)
             stores.append(store)
             fleets.append(fleet)

@@ -30,8 +30,11 @@ class CollectSettings(ObjectSelection):
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""
     ray_address: str | None = None
     """Of a running Ray cluster; a private session on this machine where none is given."""
-    job_limit_s: float = Field(300.0, gt=0)
-    """A worker that takes longer for one job is taken for hung, and replaced."""
+    rollout_limit_s: float = Field(300.0, gt=0)
+    """A worker that takes longer for one rollout is taken for hung, and replaced; after three times the rollout is
+    quarantined."""
+    memory_limit_mb: float = Field(2000.0, gt=0)
+    """What a worker may take beyond what it had after its start; at half of that it is replaced after its job."""
     procedural_per_category: int = Field(8, ge=1, le=10_000)
     """Built-in objects: how many of each category that the task applies to."""
     collection: CollectionConfig = CollectionConfig()
@@ -71,6 +74,7 @@ def _collect(command: CollectCommand) -> None:
     from cluster.locking import only_driver
     from cluster.objects import objects_for
     from cluster.session import fleets
+    from collector.guard import Limits
     from shared.plan import Plan, Setting
     from shared.store import Store
 
@@ -90,6 +94,7 @@ def _collect(command: CollectCommand) -> None:
     )
     store = Store.create(path, setting)
     plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
-    with only_driver(path), fleets(chosen.workers, chosen.job_limit_s, chosen.ray_address) as make_fleet:
-        open_fleet = partial(make_fleet, partial(make_worker, path, folder))
+    limits = Limits(chosen.rollout_limit_s, chosen.memory_limit_mb)
+    with only_driver(path), fleets(chosen.workers, limits, chosen.ray_address) as make_fleet:
+        open_fleet = partial(make_fleet, partial(make_worker, path, folder), store.underway)
         collect(store, plan, chosen.rollouts, chosen.per_shard, open_fleet, folder)

@@ -1,18 +1,25 @@
 """`adaafford store`: look into a store."""
 
+import faulthandler
 import json
 import math
 import sys
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from cluster.settings import parse_flags
 from shared.errors import UsageError
 
+if TYPE_CHECKING:
+    from shared.records import RolloutRecord
+
 ACTIONS = ("info", "verify", "digest", "replay")
+MOST_QUARANTINED = 20
+"""Quarantined rollouts that `info` lists as text; `--json` lists all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +52,10 @@ class DigestCommand:
 
 @dataclass(frozen=True, slots=True)
 class ReplayCommand:
-    """Execute one job in this process, without Ray, to see why it fails; it is committed if it does not."""
+    """Execute one job in this process, without Ray, to see why it fails; it is committed if it does not.
+
+    With --rollout, that rollout alone is executed, whatever the store says of it, and nothing is committed.
+    """
 
     store: Annotated[Path, tyro.conf.Positional]
     """Folder of the store."""
@@ -53,6 +63,8 @@ class ReplayCommand:
     """The shard that the job makes, such as random-v0-00000000-00000002."""
     objects: Path
     """Folder of the objects that the store was made with."""
+    rollout: int | None = None
+    """Number of one rollout of the job."""
 
 
 def main(args: list[str]) -> int:
@@ -80,6 +92,7 @@ def _info(command: InfoCommand) -> int:
     held = info(store)
     if command.json:
         described = asdict(held) | {
+            "quarantined": [each.model_dump() for each in held.quarantined],
             "bytes_per_interaction": held.bytes_per_interaction,
             "task": store.setting.task,
             "kind": store.setting.kind,
@@ -102,6 +115,10 @@ def _info(command: InfoCommand) -> int:
     print(f"  proposers     {tallies(held.by_proposer)}")
     print(f"  roles         {tallies(held.by_role)}")
     print(f"  categories    {tallies(held.by_category)}")
+    if held.quarantined:
+        print(f"  quarantined   {len(held.quarantined)}")
+    for each in held.quarantined[:MOST_QUARANTINED]:
+        print(f"    rollout {each.rollout}: {each.reason}\n      {each.command}")
     print(f"  policies      {', '.join(map(str, store.policy_versions())) or 'none'}")
     return 0
 
@@ -129,6 +146,7 @@ def _digest(command: DigestCommand) -> int:
 
 
 def _replay(command: ReplayCommand) -> int:
+    from collector.clock import StageClock
     from collector.worker import Worker
     from shared.store import Store
     from shared.store.layout import parse_shard_id
@@ -139,9 +157,31 @@ def _replay(command: ReplayCommand) -> int:
     plans = {plan.key: plan for plan in store.plans()}
     if job.plan_key not in plans:
         raise UsageError(f"{command.store} has no plan '{job.plan_key}'; it has: {', '.join(plans) or 'none'}")
-    print(f"running {job.shard_id}", file=sys.stderr)
-    print(Worker(command.store, command.objects).run(plans[job.plan_key], job))
+    if command.rollout is not None and not job.start <= command.rollout < job.stop:
+        raise UsageError(f"rollout {command.rollout} is not of this shard; allowed: {job.start} to {job.stop - 1}")
+    # If the engine crashes, this says where.
+    faulthandler.enable()
+    worker, plan = Worker(command.store, command.objects), plans[job.plan_key]
+    if command.rollout is not None:
+        print(f"executing rollout {command.rollout} alone; nothing is committed", file=sys.stderr)
+        print(_described(worker.execute(plan, command.rollout, StageClock())))
+        return 0
+    print(f"executing {job.shard_id}", file=sys.stderr)
+    print(worker.run(plan, job, under_way=_announce))
     return 0
+
+
+def _announce(rollout: int | None) -> None:
+    """Say which rollout begins, for whoever sees it end in a crash."""
+    if rollout is not None:
+        print(f"rollout {rollout}", file=sys.stderr, flush=True)
+
+
+def _described(record: "RolloutRecord") -> str:
+    """A rollout in one line."""
+    outcomes = Counter(row.outcome.kind.value for row in record.interactions)
+    counts = ", ".join(f"{name} {count}" for name, count in sorted(outcomes.items())) or "no interactions"
+    return f"rollout {record.index} (object {record.object.id}): {record.status}; {counts}"
 
 
 def _finite(value: Any) -> Any:

@@ -4,12 +4,10 @@ from shared.store.info import StoreInfo, Tally, info
 from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
 from shared.store.observations import ObservationArrays
 from shared.store.store import Store
-from shared.store.underway import Crumb, Underway
 from shared.store.verify import Problem, verify
 
 __all__ = [
     "SCHEMA_VERSION",
-    "Crumb",
     "FileEntry",
     "ObservationArrays",
     "Problem",
@@ -18,7 +16,6 @@ __all__ = [
     "Store",
     "StoreInfo",
     "Tally",
-    "Underway",
     "info",
     "verify",
 ]

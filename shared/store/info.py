@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from shared.store.layout import MANIFEST_FILE, ShardManifest
+from shared.store.layout import MANIFEST_FILE, Quarantined, ShardManifest
 from shared.store.store import Store
 from shared.vocabulary import OutcomeKind
 
@@ -38,6 +38,8 @@ class StoreInfo:
     by_outcome: dict[str, int]
     by_status: dict[str, int]
     """Rollouts by status."""
+    quarantined: tuple[Quarantined, ...]
+    """Rollouts that were given up, and why."""
 
     @property
     def bytes_per_interaction(self) -> float:
@@ -73,6 +75,7 @@ def info(store: Store) -> StoreInfo:
         by_role=tally(table["role"]),
         by_outcome=dict(sorted(Counter(table["outcome"]).items())),
         by_status=dict(sorted(Counter(store.rollouts().column("status").to_pylist()).items())),
+        quarantined=tuple(each for manifest in manifests for each in manifest.quarantined),
     )
 
 

@@ -9,7 +9,7 @@
         observations.zarr/           the clouds
         manifest.json                counts, checksums, content digests, provenance; written last
       policies/<version>/            whatever the learner publishes, and index.json
-      underway/                      breadcrumbs of live workers (`shared.store.underway`); no data
+      underway/                      breadcrumbs of live workers (`shared.underway`); no data
 
 Names that begin with ".tmp-" are work in progress or its remnants; names that begin with ".lock-" are locks.
 """

@@ -40,8 +40,8 @@ from shared.store.observations import ObservationArrays
 from shared.store.provenance import software_versions
 from shared.store.sealed import seal, unseal
 from shared.store.tables import INTERACTION_SCHEMA, ROLLOUT_SCHEMA
-from shared.store.underway import Underway
 from shared.store.writer import commit_shard
+from shared.underway import Underway
 
 MAX_SEED = 2**64 - 1
 

@@ -1,0 +1,219 @@
+"""Rollouts that crash, hang or fail again and again: they cost themselves alone, and never become a label."""
+
+import json
+import logging
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from cluster.blame import MAX_FAULTS, MAX_LOSSES, Blame, Failure, JobError
+from cluster.cli import run as adaafford
+from cluster.collection import Collected, collect
+from cluster.fleet import SerialFleet
+from cluster.session import fleets
+from collector.guard import Limits
+from shared.errors import StoreError
+from shared.files import process_name
+from shared.plan import Job, Plan
+from shared.records import RolloutStatus
+from shared.store import Store, verify
+from shared.underway import Crumb, Underway, summary_of
+from tests.fabricate import fabricate_rollout, fabricate_setting
+from tests.misbehaving_worker import MisbehavingWorker
+
+OBJECTS = Path("objects")
+ROLLOUTS, PER_SHARD = 12, 4
+JOB = Job("random-v0", 4, 8)
+FAULT = Failure("Segmentation fault", 5, fault=True)
+LOSS = Failure("lost", 5, fault=False)
+
+
+def new_store(path: Path) -> Store:
+    return Store.create(path, fabricate_setting())
+
+
+def fill(store: Store, mishaps: Mapping[int, str]) -> Collected:
+    fleet = SerialFleet(partial(MisbehavingWorker, store.path, mishaps))
+    return collect(store, Plan(setting=store.setting), ROLLOUTS, PER_SHARD, lambda: fleet, OBJECTS)
+
+
+def rollout_digests(store: Store) -> dict[int, str]:
+    return {index: digest for shard in store.committed() for index, digest in enumerate(shard.digests, shard.start)}
+
+
+def assert_only_these_are_missing(disturbed: Store, undisturbed: Store, culprits: set[int]) -> None:
+    """Everything else is as it would have been; of the culprits there is a row that says so, and nothing to learn."""
+    ours, theirs = rollout_digests(disturbed), rollout_digests(undisturbed)
+    assert ours.keys() == theirs.keys()
+    assert {index for index in ours if ours[index] != theirs[index]} == culprits
+    status = dict(zip(*(disturbed.rollouts().column(n).to_pylist() for n in ("rollout", "status")), strict=True))
+    assert {index for index, word in status.items() if word == "quarantined"} == culprits
+    assert not culprits & set(disturbed.interactions(["rollout"]).column("rollout").to_pylist())
+    assert {each.rollout for shard in disturbed.committed() for each in shard.quarantined} == culprits
+    assert verify(disturbed) == []
+    assert list(disturbed.underway.folder.glob("*")) == []
+
+
+def test_a_rollout_that_always_raises_is_given_up_and_nothing_else(tmp_path: Path) -> None:
+    disturbed, undisturbed = new_store(tmp_path / "disturbed"), new_store(tmp_path / "undisturbed")
+    collected = fill(disturbed, {5: "raise", 6: "raise"})
+    fill(undisturbed, {})
+    assert collected.tally.quarantined == 2
+    assert collected.tally.rollouts == ROLLOUTS
+    assert_only_these_are_missing(disturbed, undisturbed, {5, 6})
+
+
+def test_a_store_says_what_was_given_up_and_how_to_see_it_happen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    store = new_store(tmp_path / "a store")
+    with caplog.at_level(logging.WARNING):
+        fill(store, {5: "raise"})
+    command = f"adaafford store replay '{store.path}' {JOB.shard_id} --objects objects --rollout 5"
+    assert caplog.messages[-2] == "1 rollouts of random-v0 are quarantined; `adaafford store info` lists them"
+    assert caplog.messages[-1] == f"rollout 5: RuntimeError: the engine exploded (3 times); alone: {command}"
+    adaafford(["store", "info", str(store.path)])
+    printed = capsys.readouterr().out
+    assert "quarantined   1\n" in printed and command in printed
+    adaafford(["store", "info", str(store.path), "--json"])
+    listed = json.loads(capsys.readouterr().out)["quarantined"]
+    assert listed == [{"rollout": 5, "reason": "RuntimeError: the engine exploded (3 times)", "command": command}]
+
+
+def test_a_replayed_rollout_must_be_of_its_shard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = new_store(tmp_path)
+    fill(store, {})
+    assert adaafford(["store", "replay", str(tmp_path), JOB.shard_id, "--objects", "objects", "--rollout", "8"]) == 2
+    assert "rollout 8 is not of this shard; allowed: 4 to 7" in capsys.readouterr().err
+
+
+def test_a_committed_job_is_not_done_again(tmp_path: Path) -> None:
+    store = new_store(tmp_path)
+    plan = Plan(setting=store.setting)
+    first = MisbehavingWorker(store.path, {}).run(plan, JOB)
+    again = MisbehavingWorker(store.path, dict.fromkeys(range(4, 8), "raise")).run(plan, JOB)
+    assert [getattr(first, name) for name in ("shard_id", "rollouts", "interactions", "successes", "outcomes")] == [
+        getattr(again, name) for name in ("shard_id", "rollouts", "interactions", "successes", "outcomes")
+    ]
+
+
+def test_a_quarantined_rollout_can_hold_no_label(tmp_path: Path) -> None:
+    store = new_store(tmp_path)
+    plan = Plan(setting=store.setting)
+    record = replace(fabricate_rollout(plan, 0), status=RolloutStatus.QUARANTINED)
+    with pytest.raises(StoreError, match="is 'quarantined', so it cannot hold"):
+        store.commit(plan, Job(plan.key, 0, 1), [record], {})
+
+
+def test_three_faults_or_ten_losses_quarantine_a_rollout() -> None:
+    for failure, most in ((FAULT, MAX_FAULTS), (LOSS, MAX_LOSSES)):
+        blame = Blame()
+        for _ in range(most):
+            assert blame.quarantined(JOB) == {}
+            blame.charge(JOB, failure)
+        assert blame.quarantined(JOB) == {5: f"{failure.reason} ({most} times)"}
+        assert blame.quarantined(Job("random-v0", 8, 12)) == {}
+
+
+def test_faults_of_different_rollouts_do_not_add_up() -> None:
+    blame = Blame()
+    for rollout in range(4, 8):
+        for _ in range(MAX_FAULTS - 1):
+            blame.charge(JOB, Failure("crash", rollout, fault=True))
+    assert blame.quarantined(JOB) == {}
+
+
+def test_a_job_that_fails_without_a_rollout_ends_the_run() -> None:
+    blame = Blame()
+    for _ in range(MAX_FAULTS - 1):
+        blame.charge(JOB, Failure("OSError: no space left", None, fault=True))
+    with pytest.raises(JobError, match=r"^job random-v0-00000004-00000008 failed 3 times; last: OSError"):
+        blame.charge(JOB, Failure("OSError: no space left", None, fault=True))
+
+
+def test_workers_that_are_lost_as_they_start_end_the_run_only_if_none_ever_lives() -> None:
+    blame = Blame(workers=2)
+    start = Failure("lost", None, fault=False)
+    for _ in range(3):
+        for _ in range(2 * MAX_LOSSES - 1):
+            blame.charge(JOB, start)
+        blame.acquit()
+    with pytest.raises(JobError):
+        for _ in range(2 * MAX_LOSSES):
+            blame.charge(JOB, start)
+
+
+def test_a_breadcrumb_says_what_its_process_does(tmp_path: Path) -> None:
+    underway = Underway(tmp_path / "underway")
+    assert underway.crumb_of(process_name()) is None
+    underway.leave(Crumb(shard_id=JOB.shard_id, rollout=5))
+    underway.leave(Crumb(shard_id=JOB.shard_id, rollout=6))
+    assert underway.crumb_of(process_name()) == Crumb(shard_id=JOB.shard_id, rollout=6)
+    assert underway.sweep() == 0, "this process is alive"
+    underway.clear()
+    assert underway.crumb_of(process_name()) is None
+
+
+@pytest.mark.parametrize("damage", [b"", b'{"shard_id"', b"[]", b'{"shard_id":"x","rollout":-1}', b"\xff" * 100_000])
+def test_half_a_breadcrumb_blames_nobody(tmp_path: Path, damage: bytes) -> None:
+    (tmp_path / "host~1~1.json").write_bytes(damage)
+    assert Underway(tmp_path).crumb_of("host~1~1") is None
+    assert Underway(tmp_path).crumb_of("host~2~2") is None
+    assert Underway(tmp_path).fault_of("host~1~1") == ""
+
+
+def test_a_dead_process_leaves_its_last_words_until_they_are_swept(tmp_path: Path) -> None:
+    store = new_store(tmp_path)
+    script = (
+        "import ctypes, pathlib, sys\n"
+        "from collector.guard import Guard, Limits; from shared.files import process_name\n"
+        "from shared.plan import Job; from shared.underway import Underway\n"
+        "guard = Guard(Underway(pathlib.Path(sys.argv[1])), Limits())\n"
+        "guard.stand(); print(process_name(), flush=True)\n"
+        "with guard.job(Job('random-v0', 4, 8)) as under_way: under_way(5); ctypes.string_at(0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, store.underway.folder], capture_output=True, text=True, timeout=60
+    )
+    process = done.stdout.strip()
+    assert store.underway.crumb_of(process) == Crumb(shard_id=JOB.shard_id, rollout=5)
+    assert store.underway.fault_of(process).startswith("Segmentation fault, in string_at (__init__.py:")
+    assert verify(store) == []
+    assert store.sweep() == 2
+    assert list(store.underway.folder.iterdir()) == []
+
+
+def test_last_words_come_to_one_line() -> None:
+    assert summary_of("") == ""
+    assert summary_of("gibberish\n" * 1000) == "gibberish"
+    crash = 'Fatal Python error: Aborted\n\nStack (most recent call first):\n  File "/x/scene.py", line 3 in step\n'
+    assert summary_of(crash) == "Aborted, in step (scene.py:3)"
+    hang = (
+        'Timeout (0:05:00)!\nThread 0x1 (most recent call first):\n  File "/x/other.py", line 1 in wait\n\n'
+        'Thread 0x2 (most recent call first):\n  File "/x/scene.py", line 3 in step\n'
+        '  File "/x/trial.py", line 9 in run\n'
+    )
+    assert summary_of(hang) == "took more than 0:05:00, in step (scene.py:3) of run (trial.py:9)"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_crashes_hangs_and_kills_cost_themselves_alone_on_ray(tmp_path: Path) -> None:
+    mishaps = {1: "crash", 6: "hang", 7: "raise", 10: "kill"}
+    disturbed, undisturbed = new_store(tmp_path / "disturbed"), new_store(tmp_path / "undisturbed")
+    plan = Plan(setting=disturbed.setting)
+    with fleets(2, Limits(rollout_s=2.0)) as make:
+        fleet = make(partial(MisbehavingWorker, disturbed.path, mishaps), disturbed.underway)
+        collect(disturbed, plan, ROLLOUTS, PER_SHARD, lambda: fleet, OBJECTS)
+    fill(undisturbed, {})
+    assert_only_these_are_missing(disturbed, undisturbed, set(mishaps))
+    reasons = {each.rollout: each.reason for shard in disturbed.committed() for each in shard.quarantined}
+    assert reasons[1].startswith("Segmentation fault, in string_at ")
+    assert reasons[6].startswith("took more than 0:00:02, in execute (misbehaving_worker.py:")
+    assert reasons[7] == "RuntimeError: the engine exploded (3 times)"
+    assert reasons[10].startswith("its process was lost without a word")
