@@ -21,7 +21,7 @@ from collector.worker import Worker
 from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import ObjectError, UsageError
 from shared.geometry import camera_pose
-from shared.methods import method_named
+from shared.methods import METHODS, method_named
 from shared.plan import EvaluationConfig, Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import Store
@@ -178,6 +178,24 @@ def test_evaluation_gives_every_method_the_same_start_and_the_same_questions(obj
         assert [row.budget for row in exploits] == [1, 2]
         assert {row.proposer for row in tries} <= {"random", "aip"}
         assert {row.proposer for row in exploits} == {"where2act" if method == "where2act" else "aap"}
+
+
+def test_methods_use_their_own_proposers_budgets_and_policies(objects: Path) -> None:
+    methods = ("where2act-interaction", "where2act-adaptation", "ours-argfps", "ours-no-iteration", "ours-final")
+    evaluation = EvaluationConfig(methods=methods, budgets=(2, 1), queries=1)
+    plan = plan_for(objects, kind="evaluation", evaluation=evaluation).model_copy(update={"policy_version": 3})
+    record = rollout(plan, objects)
+    for name in methods:
+        method, rows = METHODS[name], [row for row in record.interactions if row.method == name]
+        version = 1 if name == "ours-no-iteration" else 3
+        assert {row.policy_version for row in rows} == {version}
+        tries = [row for row in rows if row.role is Role.CONTEXT]
+        exploits = [row for row in rows if row.role is Role.EXPLOIT]
+        assert {row.proposer for row in tries} == {method.tries}
+        assert {row.proposer for row in exploits} == {method.critic}
+        budgets = [4] if name == "where2act-interaction" else [1, 2]
+        assert [row.budget for row in exploits] == budgets
+        assert len(tries) == budgets[-1]
 
 
 def test_draws_depend_on_the_plan_and_the_number_alone(objects: Path) -> None:
