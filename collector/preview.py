@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from collector.articulation import ArticulatedObject
-from collector.camera import EmbreeCamera
+from collector.camera import DepthImage, EmbreeCamera
 from shared.configuration import CameraConfig
 from shared.errors import UsageError
 from shared.files import write_atomically
@@ -57,6 +57,15 @@ def contact_sheet(
         axes.imshow(picture(target, openness, azimuth_deg, image_size))
         axes.set_title(f"{target.ref.id}\n{target.ref.category}", fontsize=7, y=-0.12)
     figure.subplots_adjust(left=0.0, right=1.0, bottom=0.04, top=1.0, wspace=0.02, hspace=0.16)
+    save(figure, out_png)
+
+
+def save(figure: Figure, out_png: Path) -> None:
+    """Write a figure as a PNG file, making its folder if need be.
+
+    Raises:
+        UsageError: it cannot be written.
+    """
     image = BytesIO()
     figure.savefig(image, format="png")
     try:
@@ -68,14 +77,18 @@ def contact_sheet(
 
 def picture(target: ArticulatedObject, openness: float, azimuth_deg: float, size: int) -> Float:
     """One object, [size, size, 3], colours in [0, 1], on white."""
-    config = CameraConfig(image_size=size)
+    config, limits = CameraConfig(image_size=size), target.limits()
+    positions = limits[:, 0] + openness * (limits[:, 1] - limits[:, 0])
     camera = EmbreeCamera(target, camera_pose(azimuth_deg, 30.0, config.distance), config)
-    limits = target.limits()
-    image = camera.capture(limits[:, 0] + openness * (limits[:, 1] - limits[:, 0]))
+    return shaded(camera.capture(positions), part_colours(len(target.parts)), size)
+
+
+def shaded(image: DepthImage, colours: Float, size: int) -> Float:
+    """A picture, [size, size, 3], in [0, 1], of what a camera saw, on white; `colours`, [bodies, 3], of each body."""
     light = AMBIENT + (1 - AMBIENT) * np.clip(image.normals @ np.array(LIGHT_FROM), 0.0, 1.0)
-    colours = np.ones((size * size, 3))
-    colours[image.pixels] = part_colours(len(target.parts))[image.bodies] * light[:, None]
-    return colours.reshape(size, size, 3)
+    picture = np.ones((size * size, 3))
+    picture[image.pixels] = colours[image.bodies] * light[:, None]
+    return picture.reshape(size, size, 3)
 
 
 def part_colours(parts: int) -> Float:

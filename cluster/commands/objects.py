@@ -9,8 +9,9 @@ from pydantic import Field
 
 from cluster.settings import parse_flags
 from shared.errors import UsageError
+from shared.vocabulary import Primitive
 
-ACTIONS = ("generate", "check", "preview", "decompose")
+ACTIONS = ("generate", "check", "preview", "film", "decompose")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +55,20 @@ class PreviewCommand:
 
 
 @dataclass(frozen=True, slots=True)
+class FilmCommand:
+    """Draw one object's trials: each primitive at its start, at first contact and at its end."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """One object's folder, or a folder of objects, whose first usable one is taken."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """The picture, a PNG."""
+    primitives: tuple[Primitive, ...] = tuple(Primitive)
+    """Only these."""
+    seed: int = 1
+    """Of the random trials, one of which is shown of each primitive."""
+
+
+@dataclass(frozen=True, slots=True)
 class DecomposeCommand:
     """Decompose collision meshes into convex pieces, once and for all, for `--collection.collision decomposed`."""
 
@@ -70,6 +85,8 @@ def main(args: list[str]) -> int:
             return _check(parse_flags(CheckCommand, args[1:], "objects check"))
         case ["preview"]:
             return _preview(parse_flags(PreviewCommand, args[1:], "objects preview"))
+        case ["film"]:
+            return _film(parse_flags(FilmCommand, args[1:], "objects film"))
         case ["decompose"]:
             return _decompose(parse_flags(DecomposeCommand, args[1:], "objects decompose"))
         case ["-h" | "--help"]:
@@ -114,6 +131,19 @@ def _preview(command: PreviewCommand) -> int:
     shown = usable[: command.most]
     contact_sheet([load(entry) for entry in shown], command.out)
     print(f"{command.out}: {len(shown)} of {len(usable)} usable objects")
+    return 0
+
+
+def _film(command: FilmCommand) -> int:
+    from collector.catalogue import load, scan
+    from collector.film import film
+
+    usable = scan(command.path).usable
+    if not usable or not command.primitives:
+        raise UsageError(f"{command.path}: a film needs a usable object and a primitive; try `adaafford objects check`")
+    for caption in film(load(usable[0]), command.primitives, command.seed, command.out):
+        print(caption)
+    print(f"{command.out}: {usable[0].ref.id}, {usable[0].ref.category}")
     return 0
 
 

@@ -1,0 +1,216 @@
+"""Pictures of trials: the hand and the object when a primitive starts, first touches, and has ended."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.spatial import ConvexHull
+
+from collector.articulation import ArticulatedObject, Body, Joint, Mesh
+from collector.camera import DepthImage, EmbreeCamera
+from collector.clock import StageClock
+from collector.environment import SapienEnvironment
+from collector.gripper import finger, palm
+from collector.preview import part_colours, save, shaded
+from collector.primitives import Trial
+from collector.proposers import RandomProposer
+from collector.scene import Scene
+from shared import seeds
+from shared.configuration import CameraConfig, Fidelity
+from shared.errors import UsageError
+from shared.geometry import camera_pose
+from shared.tasks import task_named
+from shared.vocabulary import Action, Float, HiddenDynamics, Outcome, Primitive
+
+FIDELITY = Fidelity(name="film", skip_free_flight=False)
+DYNAMICS = HiddenDynamics(part_mass=0.2, joint_friction=0.3, surface_friction=2.0)
+SEEN_FROM = (190.0, 40.0)
+"""Azimuth and elevation, deg, of the camera whose cloud the actions are drawn from."""
+STATES, TRIES = 12, 20
+"""States drawn for a primitive at the most, and random actions tried from each of them."""
+ENOUGH = 4
+"""Successes, of which the one that takes the touched point the farthest is shown."""
+EDGE_SHARE = 0.5
+"""As in pull tasks; pushes there move their part as well."""
+SIDES_DEG = (-50.0, 50.0)
+"""Azimuths of the film's camera, from straight behind the hand; the one from which more of the hand is seen is used."""
+CLOSE_UP = CameraConfig(image_size=260, field_of_view_deg=14.0)
+PALM_COLOUR, FINGER_COLOUR = (0.2, 0.2, 0.25), (1.0, 0.8, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where everything is at one moment of a trial.
+
+    Attributes:
+        joint_positions: [parts], of the object.
+        hand: [3, 4, 4], world_from_link of the palm and both fingers.
+    """
+
+    joint_positions: Float
+    hand: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Take:
+    """One filmed trial; `contact` is None where the hand touched nothing."""
+
+    action: Action
+    primitive: Primitive
+    outcome: Outcome
+    start: Pose
+    contact: Pose | None
+    end: Pose
+
+    @property
+    def moments(self) -> dict[str, Pose]:
+        """What there is to be seen, in order."""
+        if self.contact is None:
+            return {"start": self.start, "end, no contact": self.end}
+        return {"start": self.start, "first contact": self.contact, "end": self.end}
+
+    @property
+    def caption(self) -> str:
+        """What came of it, in a few words."""
+        success = "success" if self.outcome.success else "failure"
+        return f"{self.primitive.value}: {self.outcome.kind.value}, {success}, m = {self.outcome.motion:.3f}"
+
+
+class FilmedTrial(Trial):
+    """A trial that remembers where everything was at its moments."""
+
+    def __init__(self, scene: Scene, action: Action, target: int, primitive: Primitive) -> None:
+        super().__init__(scene, action, target, primitive, FIDELITY)
+        self._first: Pose | None = None
+        self._contact: Pose | None = None
+        self._last: Pose | None = None
+
+    def take(self) -> Take:
+        """Execute the trial."""
+        outcome = self.run()
+        assert self._first is not None and self._last is not None, "a trial takes at least one step"
+        return Take(self.action, self.primitive, outcome, self._first, self._contact, self._last)
+
+    def _step(self) -> None:
+        try:
+            super()._step()
+        finally:  # A contact that ends the trial is its last moment.
+            self._last = _pose_of(self.scene)
+            self._first = self._first or self._last
+            if self._contact is None and self.scene.contact().brushes:
+                self._contact = self._last
+
+
+def film(target: ArticulatedObject, primitives: Sequence[Primitive], seed: int, out_png: Path) -> list[str]:
+    """Write a picture of one trial of each primitive, a random one that succeeds wherever one is found.
+
+    Args:
+        target: the object.
+        primitives: what to show, in this order.
+        seed: of the random trials.
+        out_png: file to write.
+
+    Returns:
+        The caption of each trial.
+
+    Raises:
+        UsageError: no camera sees a part that moves, or the file cannot be written.
+    """
+    takes = [_best_take(target, primitive, seed) for primitive in primitives]
+    across = 1 if len(takes) < 4 else 2
+    rows = int(np.ceil(len(takes) / across))
+    figure = Figure(figsize=(across * 3 * 2.2, rows * 2.5), dpi=CLOSE_UP.image_size / 2.2)
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, across * 3, squeeze=False)
+    for axes in grid.ravel():
+        axes.set_axis_off()
+    for number, take in enumerate(takes):
+        row, column = divmod(number, across)
+        for place, (moment, image) in enumerate(zip(take.moments, _pictures(target, take), strict=True)):
+            axes = grid[row, 3 * column + place]
+            axes.imshow(image)
+            axes.text(0.5, -0.05, moment, fontsize=7, ha="center", transform=axes.transAxes)
+        grid[row, 3 * column + 1].set_title(take.caption, fontsize=8, pad=3)
+    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.03, top=0.95, wspace=0.03, hspace=0.2)
+    save(figure, out_png)
+    return [take.caption for take in takes]
+
+
+def _best_take(target: ArticulatedObject, primitive: Primitive, seed: int) -> Take:
+    """Of a few random successes the one that takes the touched point the farthest; without any, the last failure."""
+    successes, failure = list[Take](), None
+    for take in _takes(target, primitive, seed):
+        if not take.outcome.success:
+            failure = take
+            continue
+        successes.append(take)
+        if len(successes) == ENOUGH:
+            break
+    if successes:
+        return max(successes, key=lambda take: float(np.linalg.norm(take.outcome.displacement)))
+    if failure is None:
+        raise UsageError(f"{target.ref.id}: no part that moves comes to rest in view of the camera; try another object")
+    return failure
+
+
+def _takes(target: ArticulatedObject, primitive: Primitive, seed: int) -> Iterator[Take]:
+    """Random trials from random states."""
+    pixels, states, actions = (
+        seeds.generator(seed, f"film/{purpose}/{primitive.value}", 0) for purpose in ("pixels", "states", "actions")
+    )
+    camera, task = CameraConfig(), task_named("pull" if primitive.pulls else "push")
+    pose = camera_pose(*SEEN_FROM, camera.distance)
+    environment = SapienEnvironment(target, task, primitive, DYNAMICS, pose, camera, FIDELITY, pixels, StageClock())
+    proposer = RandomProposer(actions, EDGE_SHARE)
+    for _ in range(STATES):
+        if not (environment.reset(states) and environment.shows_a_target()):
+            continue
+        observation, positions = environment.observe(), environment.state()
+        for _ in range(TRIES):
+            action = proposer.propose(observation, ())
+            assert action is not None, "the observation shows a target"
+            environment.restore(positions)
+            yield FilmedTrial(
+                environment.scene, action, int(observation.part_ids[action.point_index]), primitive
+            ).take()
+
+
+def _pose_of(scene: Scene) -> Pose:
+    links = (scene.gripper.palm, *scene.gripper.fingers)
+    hand = [np.asarray(link.entity_pose.to_transformation_matrix(), dtype=np.float64) for link in links]
+    return Pose(scene.joint_positions(), np.stack(hand))
+
+
+def _pictures(target: ArticulatedObject, take: Take) -> list[Float]:
+    """The moments from the side that shows more of the hand, the camera on the touched point."""
+    shots = [[_capture(target, take.action, pose, side) for pose in take.moments.values()] for side in SIDES_DEG]
+    best = max(shots, key=lambda images: sum(int((i.bodies > len(target.parts)).sum()) for i in images))
+    colours = np.concatenate([part_colours(len(target.parts)), [PALM_COLOUR, FINGER_COLOUR, FINGER_COLOUR]])
+    return [shaded(image, colours, CLOSE_UP.image_size) for image in best]
+
+
+def _capture(target: ArticulatedObject, action: Action, pose: Pose, side_deg: float) -> DepthImage:
+    behind = -action.approach
+    level = float(np.hypot(behind[0], behind[1]))
+    azimuth = np.rad2deg(np.arctan2(behind[1], behind[0])) if level > 0.3 else 180.0
+    camera = camera_pose(float(azimuth) + side_deg, 25.0, CLOSE_UP.distance)
+    camera[:3, 3] += action.point
+    with_hand = ArticulatedObject(target.ref, (*target.bodies, *_hand_bodies(pose.hand)))
+    return EmbreeCamera(with_hand, camera, CLOSE_UP).capture(np.append(pose.joint_positions, np.zeros(3)))
+
+
+def _hand_bodies(hand: Float) -> list[Body]:
+    """The palm and the fingers as bodies that stand where `hand`, [3, 4, 4], has them at joint position 0."""
+    shapes = [_closed(mesh) for mesh in (palm(), finger(), finger())]
+    joints = [
+        Joint("", "prismatic", 0, world_from_link, np.array([1.0, 0.0, 0.0]), 0.0, 0.0) for world_from_link in hand
+    ]
+    return [Body("", "hand", joint, (shape,), ()) for joint, shape in zip(joints, shapes, strict=True)]
+
+
+def _closed(mesh: Mesh) -> Mesh:
+    """The convex hull of a mesh's vertices as triangles."""
+    return Mesh(mesh.vertices, ConvexHull(mesh.vertices).simplices.astype(np.int32))
