@@ -86,6 +86,8 @@ def train(
     fingerprint: str = "",
     title: str = "",
     hardware: Hardware | None = None,
+    *,
+    silent: bool = False,
 ) -> TrainingResult:
     """Train a stage, from its last checkpoint in `out` where there is one.
 
@@ -97,12 +99,13 @@ def train(
         fingerprint: of everything that the result depends on; a checkpoint with another one is refused.
         title: what lines of progress call it; the stage's name where none is given.
         hardware: what to train on, where the stage's module and data already are; the CPU where none is given.
+        silent: say nothing of how it goes.
 
     Raises:
         UsageError: the checkpoint is of another run, or the loss is not finite.
         StoreError: the checkpoint is damaged.
     """
-    return _Loop(stage, config, seed, out, fingerprint, hardware or Hardware()).run(title or stage.name)
+    return _Loop(stage, config, seed, out, fingerprint, hardware or Hardware()).run(title or stage.name, silent)
 
 
 class _Losses(nn.Module):
@@ -141,15 +144,18 @@ class _Loop:
         # Nobody may write a checkpoint before everybody has read the last one.
         sharing.wait_for_all()
         losses = _Losses(stage)
-        # Where a stage leaves parts of its module as they are, these never get a gradient.
-        together = sharing.processes() > 1
-        self._forward: nn.Module = DistributedDataParallel(losses, find_unused_parameters=True) if together else losses
+        self._forward: nn.Module = losses
+        if sharing.processes() > 1:
+            # What a stage leaves as it is gets no gradient, which would be waited for.
+            learning = sum(len(group.parameters) for group in self.groups)
+            some_rest = learning < sum(parameter.requires_grad for parameter in losses.parameters())
+            self._forward = DistributedDataParallel(losses, find_unused_parameters=some_rest)
         self._viewer = EventFiles(out / EVENTS_FOLDER, self.cursor.step) if sharing.rank() == 0 else None
         self._saved_at = time.monotonic()
 
-    def run(self, title: str) -> TrainingResult:
+    def run(self, title: str, silent: bool) -> TrainingResult:
         """Step until the steps, the seconds or the patience are used up."""
-        config, silent = self.config, sharing.rank() > 0
+        config, silent = self.config, silent or sharing.rank() > 0
         with ProgressReport(title, config.steps, config.seconds, self.cursor.step, silent=silent) as report:
             while not self._finished():
                 self._step()

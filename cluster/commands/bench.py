@@ -1,4 +1,4 @@
-"""`adaafford bench`: measure collection, and what its data are worth."""
+"""`adaafford bench`: measure collection, what its data are worth, and how fast they are learnt from."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +20,7 @@ from shared.vocabulary import Primitive
 if TYPE_CHECKING:
     from shared.plan import Plan
 
-ACTIONS = ("fidelity", "dynamics", "collect")
+ACTIONS = ("fidelity", "dynamics", "collect", "learner", "adapt")
 
 
 class BenchSettings(ObjectSelection):
@@ -106,6 +106,14 @@ def main(args: list[str]) -> int:
             return _dynamics(parse_flags(DynamicsCommand, args[1:], "bench dynamics").settings)
         case ["collect"]:
             return _collect(parse_flags(CollectCommand, args[1:], "bench collect").settings)
+        case ["learner"]:
+            from cluster.commands.bench_learner import learner
+
+            return learner(args[1:])
+        case ["adapt"]:
+            from cluster.commands.bench_learner import adapt
+
+            return adapt(args[1:])
         case ["-h" | "--help"]:
             print(f"usage: adaafford bench {{{','.join(ACTIONS)}}}; `adaafford bench fidelity --help` tells more")
             return 0
@@ -117,7 +125,7 @@ def _fidelity(command: FidelitySettings) -> int:
     from cluster.benchmarks.fidelity import compare
     from cluster.benchmarks.progress import progress
 
-    with _planned(command) as (plan, folder), progress(f"trials, {command.task}", command.trials) as advance:
+    with planned(command) as (plan, folder), progress(f"trials, {command.task}", command.trials) as advance:
         result = compare(plan, folder, command.reference, command.candidate, command.trials, advance)
     print(f"{result.trials} trials on {result.objects} objects, {result.positives} positives in the reference")
     print(f"  label agreement   {result.label_agreement:.1%}")
@@ -129,14 +137,14 @@ def _fidelity(command: FidelitySettings) -> int:
     for change, count in result.confusions:
         print(f"  {count:>4} x {change}")
     fidelities = {"reference": command.reference.model_dump(), "candidate": command.candidate.model_dump()}
-    return _finish(command, "fidelity", result.as_json() | fidelities)
+    return finish(command, "fidelity", result.as_json() | fidelities)
 
 
 def _dynamics(command: DynamicsSettings) -> int:
     from cluster.benchmarks.dynamics import ALL, measure
     from cluster.benchmarks.progress import progress
 
-    with _planned(command) as (plan, folder), progress(f"rollouts, {command.task}", command.rollouts) as advance:
+    with planned(command) as (plan, folder), progress(f"rollouts, {command.task}", command.rollouts) as advance:
         found = measure(plan, folder, command.rollouts, command.draws, command.actions, advance)
     print(f"{'category':<18}{'trials':>7}{'success':>9}{'pairs':>7}{'ever':>6}{'depends on draw':>17}  outcomes")
     for name, figures in found.items():
@@ -147,7 +155,7 @@ def _dynamics(command: DynamicsSettings) -> int:
         )
     categories = {name: figures.as_json() for name, figures in found.items() if name != ALL}
     told = {"draws": command.draws, "edge_share": plan.setting.collection.rollout.edge_share, "categories": categories}
-    return _finish(command, "dynamics", found[ALL].as_json() | told)
+    return finish(command, "dynamics", found[ALL].as_json() | told)
 
 
 def _collect(command: CollectSettings) -> int:
@@ -157,7 +165,7 @@ def _collect(command: CollectSettings) -> int:
     from cluster.benchmarks.collecting import CollectionBenchmark
     from cluster.benchmarks.progress import progress
 
-    with _planned(command) as (plan, folder):
+    with planned(command) as (plan, folder):
         benchmark = CollectionBenchmark(plan, folder, command.rollouts, command.repeats, command.sample)
         with progress(f"jobs and published trials, {command.task}", benchmark.steps) as advance:
             benchmark.run(advance)
@@ -168,7 +176,7 @@ def _collect(command: CollectSettings) -> int:
             with progress(f"turns of 1 and {command.workers} workers", 2 * command.repeats + 2) as advance:
                 result |= speedup(plan, folder, command.rollouts, command.repeats, command.workers, advance)
     _print_collect(result)
-    return _finish(command, "collect", result)
+    return finish(command, "collect", result)
 
 
 def _print_collect(result: dict[str, Any]) -> None:
@@ -193,7 +201,7 @@ def _print_collect(result: dict[str, Any]) -> None:
 
 
 @contextmanager
-def _planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
+def planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
     """A plan of random interactions, and the folder of its objects; built-in objects last as long as the context."""
     task = task_named(command.task)
     from cluster.objects import objects_for
@@ -208,12 +216,12 @@ def _planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
         yield Plan(setting=Setting(task=task.name, seed=command.seed, objects=refs, collection=config)), folder
 
 
-def _finish(command: BenchSettings, name: str, result: dict[str, Any]) -> int:
+def finish(command: BenchSettings, name: str, result: dict[str, Any]) -> int:
     """Keep and print the result."""
     from cluster.benchmarks.results import as_line, keep
 
     objects = "built-in" if command.objects is None else command.objects.name
-    result |= {"benchmark": name, "task": command.task, "objects_from": objects, "seed": command.seed}
+    result = {"task": command.task} | result | {"benchmark": name, "objects_from": objects, "seed": command.seed}
     if command.primitive is not None:
         result["primitive"] = command.primitive.value
     if command.out is not None:
