@@ -51,7 +51,8 @@ def evaluate(
             return
         environment.restore(start)
         method = method_named(name)
-        recorder.policy_version = version = method.policy_version(plan.policy_version)
+        version = method.policy_version(plan.policy_version)
+        recorder.policy_version = version
         exploiter = make_proposer(method.critic, rng(f"exploit/{name}"), version)
         context: Proposer | None = None
         if method.tries == RandomProposer.name:
