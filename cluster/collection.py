@@ -52,7 +52,7 @@ def collect(store: Store, plan: Plan, rollouts: int, per_shard: int, open_fleet:
     done = [(shard.start, shard.stop) for shard in store.committed(plan.key)]
     jobs = missing_jobs(plan.key, rollouts, done, per_shard)
     already = sum(stop - start for start, stop in done)
-    progress = CollectionProgress(f"collecting {plan.key}", already, rollouts, str(store.path))
+    progress = CollectionProgress(f"collecting {plan.key}", already, rollouts, store.where)
     with progress:
         if not jobs:
             return Collected(progress.tally, 0.0, 0)
@@ -62,7 +62,7 @@ def collect(store: Store, plan: Plan, rollouts: int, per_shard: int, open_fleet:
         try:
             fleet.run(plan, jobs, progress)
         except JobError as error:
-            command = reproduction(store.path, error.job.shard_id, objects)
+            command = reproduction(store.where, error.job.shard_id, objects)
             raise WorkerError(f"{error}; reproduce it with: {command}") from None
     if progress.tally.quarantined:
         _report_quarantined(store, plan)

@@ -40,7 +40,7 @@ WorkerFactory = Callable[[], Worker]
 """Makes a worker in the process that will use it; must be picklable for a fleet of processes."""
 
 
-def make_worker(store: Path, objects: Path) -> Worker:
+def make_worker(store: str | Path, objects: Path) -> Worker:
     """Make a `collector.worker.Worker` in the process that calls; `partial` of this is a `WorkerFactory`.
 
     The engine is imported here and not by the driver, which needs none where Ray's actors do the work.

@@ -70,7 +70,7 @@ class Worker:
     """
 
     def __init__(self, store: str | Path, objects: Path) -> None:
-        self._store = Store.open(Path(store))
+        self._store = Store.open(store)
         self._folder = objects
         self._objects: dict[str, ArticulatedObject] = {}
         self._adapters: dict[int, Adapter] = {}
@@ -124,7 +124,7 @@ class Worker:
             Quarantined(
                 rollout=index,
                 reason=reason[:MAX_REASON],
-                command=reproduction(self._store.path, job.shard_id, self._folder, index),
+                command=reproduction(self._store.where, job.shard_id, self._folder, index),
             )
             for index, reason in sorted(quarantined.items())
         ]

@@ -124,7 +124,7 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
     cells = {name: column_values(table, known[name]) for name in (*COLUMNS, "observation")}
     keep = np.flatnonzero([OutcomeKind(kind).is_label for kind in cells["outcome"]])
     if not len(keep):
-        raise StoreError(f"{store.path}: holds no interaction to learn from; collect some first")
+        raise StoreError(f"{store.where}: holds no interaction to learn from; collect some first")
     cells = {name: _take(values, keep) for name, values in cells.items()}
     shards = _take(table.column("shard").to_pylist(), keep)
     names = list(zip(shards, cells["observation"].tolist(), strict=True))
@@ -226,7 +226,7 @@ def _read_clouds(
         if arrays is None or name != shard:
             shard, arrays = name, store.read_observations(name)
         if not 0 <= index < len(arrays):
-            raise StoreError(f"{store.path}: shard {name} has no observation {index}; it is damaged")
+            raise StoreError(f"{store.where}: shard {name} has no observation {index}; it is damaged")
         view = view_from_world(arrays.world_from_camera[index])
         points.append((arrays.points[index] @ view.T.astype(np.float32)).astype(np.float32))
         movable.append(arrays.movable[index])

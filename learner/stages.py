@@ -60,7 +60,7 @@ class StageJob:
 
     Attributes:
         stage: which one.
-        store: folder of the store.
+        store: folder or URL of the store.
         out: folder for what it makes.
         init: folder with the policy to start from; None: random weights (the prior only).
         train_objects: ids of the objects to learn from (see `learner.data.split`).
@@ -69,7 +69,7 @@ class StageJob:
     """
 
     stage: StageName
-    store: Path
+    store: str | Path
     out: Path
     init: Path | None = None
     train_objects: Collection[str] | None = None

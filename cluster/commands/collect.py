@@ -45,8 +45,8 @@ class CollectCommand:
     """Collect interactions into a store. The same command again goes on where it was stopped."""
 
     settings: Annotated[CollectSettings, tyro.conf.arg(name="")]
-    store: Path
-    """Folder of the store: new, or of the same setting."""
+    store: str
+    """Folder or s3:// URL of the store: new, or of the same setting."""
     proposer: Literal["random", "aip"] = "random"
     """Who chooses the interactions."""
     policy: int = 0
@@ -71,18 +71,18 @@ def main(args: list[str]) -> int:
 def _collect(command: CollectCommand) -> None:
     from cluster.collection import collect
     from cluster.fleet import make_worker
-    from cluster.locking import only_driver
     from cluster.objects import objects_for
     from cluster.session import fleets
     from collector.guard import Limits
     from shared.plan import Plan, Setting
     from shared.store import Store
+    from shared.store.place import absolute, folder_beside
 
-    chosen, path = command.settings, command.store.resolve()
+    chosen, where = command.settings, absolute(command.store)
     catalogue, folder = objects_for(
         task_named(chosen.task),
         chosen,
-        path.with_name(f"{path.name}-objects"),
+        folder_beside(where, "objects"),
         chosen.procedural_per_category,
         chosen.seed,
     )
@@ -92,9 +92,9 @@ def _collect(command: CollectCommand) -> None:
         objects=tuple(entry.ref for entry in catalogue.usable),
         collection=task_named(chosen.task).resolve(chosen.collection),
     )
-    store = Store.create(path, setting)
+    store = Store.create(where, setting)
     plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
     limits = Limits(chosen.rollout_limit_s, chosen.memory_limit_mb)
-    with only_driver(path), fleets(chosen.workers, limits, chosen.ray_address) as make_fleet:
-        open_fleet = partial(make_fleet, partial(make_worker, path, folder), store.underway)
+    with store.only_driver(), fleets(chosen.workers, limits, chosen.ray_address) as make_fleet:
+        open_fleet = partial(make_fleet, partial(make_worker, where, folder), store.underway)
         collect(store, plan, chosen.rollouts, chosen.per_shard, open_fleet, folder)

@@ -26,8 +26,8 @@ MOST_QUARANTINED = 20
 class InfoCommand:
     """Say what a store holds."""
 
-    store: Annotated[Path, tyro.conf.Positional]
-    """Folder of the store."""
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object instead of text."""
 
@@ -36,8 +36,8 @@ class InfoCommand:
 class VerifyCommand:
     """Recompute everything that a store claims; the exit code is 1 if anything is wrong."""
 
-    store: Annotated[Path, tyro.conf.Positional]
-    """Folder of the store."""
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object instead of text."""
 
@@ -46,8 +46,8 @@ class VerifyCommand:
 class DigestCommand:
     """Print the content digest as the last line: the same for the same interactions, whoever made them, and when."""
 
-    store: Annotated[Path, tyro.conf.Positional]
-    """Folder of the store."""
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +57,8 @@ class ReplayCommand:
     With --rollout, that rollout alone is executed, whatever the store says of it, and nothing is committed.
     """
 
-    store: Annotated[Path, tyro.conf.Positional]
-    """Folder of the store."""
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
     shard: Annotated[str, tyro.conf.Positional]
     """The shard that the job makes, such as random-v0-00000000-00000002."""
     objects: Path

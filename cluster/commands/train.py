@@ -29,8 +29,8 @@ class TrainCommand:
     """Train networks from a finished store. The same command again goes on where it was stopped."""
 
     settings: Annotated[LearnerConfig, tyro.conf.arg(name="")]
-    store: Path
-    """Folder of the store; it is only read."""
+    store: str
+    """Folder or s3:// URL of the store; it is only read."""
     out: Path
     """Folder for the policy, its metrics and checkpoints: new, or of the same training."""
     init: Path | None = None

@@ -4,7 +4,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from shared.store.layout import MANIFEST_FILE, Quarantined, ShardManifest
+from shared.store.layout import MANIFEST_FILE, MAX_DOCUMENT_BYTES, Quarantined, ShardManifest
+from shared.store.reader import shard_folder
 from shared.store.store import Store
 from shared.vocabulary import OutcomeKind
 
@@ -80,4 +81,4 @@ def info(store: Store) -> StoreInfo:
 
 
 def _manifest_bytes(store: Store, manifest: ShardManifest) -> int:
-    return (store.shards_folder / manifest.shard_id / MANIFEST_FILE).stat().st_size
+    return len(shard_folder(store.place, manifest.shard_id).read(MANIFEST_FILE, MAX_DOCUMENT_BYTES))

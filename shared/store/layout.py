@@ -10,6 +10,7 @@
         manifest.json                counts, checksums, content digests, provenance; written last
       policies/<version>/            whatever the learner publishes, and index.json
       underway/                      breadcrumbs of live workers (`shared.underway`); no data
+      aside/                         what `store repair` or `store compact` took out; no data, and nothing reads it
 
 Names that begin with ".tmp-" are work in progress or its remnants; names that begin with ".lock-" are locks.
 """
@@ -35,6 +36,7 @@ SHARDS_FOLDER = "shards"
 POLICIES_FOLDER = "policies"
 UNDERWAY_FOLDER = "underway"
 LOCK_PREFIX = ".lock-"
+ASIDE_FOLDER = "aside"
 
 MAX_DOCUMENT_BYTES = 64 << 20
 """No document of a store is larger; a million objects in a setting would be."""

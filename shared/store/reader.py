@@ -3,13 +3,11 @@
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shared.errors import StoreError
-from shared.files import read_bounded
 from shared.plan import Job, ObjectRef
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store import observations
@@ -20,11 +18,13 @@ from shared.store.layout import (
     MAX_DOCUMENT_BYTES,
     OBSERVATIONS_FOLDER,
     ROLLOUTS_FILE,
+    SHARDS_FOLDER,
     ShardManifest,
     parse_manifest,
     parse_shard_id,
 )
 from shared.store.observations import ObservationArrays
+from shared.store.place import Folder, Place
 from shared.store.tables import INTERACTION_SCHEMA, MAX_ROW_BYTES, ROLLOUT_SCHEMA, column_values, read_table
 from shared.store.validity import check_rollouts
 from shared.vocabulary import (
@@ -40,28 +40,56 @@ from shared.vocabulary import (
 )
 
 
-def is_committed(shard: Path) -> bool:
+def shard_folder(place: Place, shard_id: str) -> Folder:
+    """Where a shard lies, or would."""
+    return Folder(place, f"{SHARDS_FOLDER}/{shard_id}")
+
+
+def is_committed(shard: Folder) -> bool:
     """Whether a shard's folder holds a manifest."""
-    return (shard / MANIFEST_FILE).exists()
+    return shard.has(MANIFEST_FILE)
 
 
-def committed_shards(shards: Path, plan_key: str | None = None) -> Iterator[Path]:
-    """Folders of the committed shards, in order of name."""
-    names = sorted(path.name for path in shards.iterdir()) if shards.is_dir() else []
-    for name in names:
+def shard_folders(place: Place, plan_key: str | None = None) -> Iterator[Folder]:
+    """Folders that are called as shards are, committed or not, in order of name."""
+    for name in place.names(SHARDS_FOLDER):
         job = parse_shard_id(name)
-        if job is not None and plan_key in (None, job.plan_key) and is_committed(shards / name):
-            yield shards / name
+        if job is not None and plan_key in (None, job.plan_key):
+            yield shard_folder(place, name)
 
 
-def read_manifest(shard: Path) -> ShardManifest:
-    """The manifest of a shard.
+def committed_shards(place: Place, plan_key: str | None = None) -> list[Folder]:
+    """Folders of the committed shards, in order of name."""
+    folders = list(shard_folders(place, plan_key))
+    there = place.exist([f"{folder.key}/{MANIFEST_FILE}" for folder in folders])
+    return [folder for folder, is_there in zip(folders, there, strict=True) if is_there]
+
+
+def read_manifests(shards: Sequence[Folder]) -> list[ShardManifest]:
+    """The manifests of some committed shards of one place.
+
+    Raises:
+        StoreError: one is damaged, foreign, of another schema version, or another shard's.
+    """
+    if not shards:
+        return []
+    contents = shards[0].place.read_all([(f"{shard.key}/{MANIFEST_FILE}", MAX_DOCUMENT_BYTES) for shard in shards])
+    return [checked_manifest(shard, data) for shard, data in zip(shards, contents, strict=True)]
+
+
+def read_manifest(shard: Folder) -> ShardManifest:
+    """The manifest of a shard; raises as `checked_manifest` does."""
+    return checked_manifest(shard, shard.read(MANIFEST_FILE, MAX_DOCUMENT_BYTES))
+
+
+def checked_manifest(shard: Folder, data: bytes) -> ShardManifest:
+    """The manifest of a shard, from hostile bytes.
 
     Raises:
         StoreError: it is damaged, foreign, of another schema version, or another shard's.
     """
-    path = shard / MANIFEST_FILE
-    manifest = parse_manifest(read_bounded(path, MAX_DOCUMENT_BYTES), str(path))
+    path = f"{shard}/{MANIFEST_FILE}"
+    manifest = parse_manifest(data, path)
     if manifest.shard_id != shard.name:
         raise StoreError(f"{path}: belongs to shard {manifest.shard_id}; put the folder back under its own name")
     expected = expected_files(manifest)
@@ -85,16 +113,22 @@ def expected_files(manifest: ShardManifest) -> dict[str, int]:
     }
 
 
-def read_file(shard: Path, manifest: ShardManifest, name: str) -> bytes:
+def read_file(shard: Folder, manifest: ShardManifest, name: str) -> bytes:
     """A file of a shard, of the size and checksum that the manifest states.
 
     Raises:
         StoreError: it is missing, or is not what was committed.
     """
-    path, entry = shard / name, manifest.files[name]
-    if any(parent.is_symlink() for parent in path.parents if parent.is_relative_to(shard)):
-        raise StoreError(f"{path}: reached through a symbolic link; replace it by the folder itself")
-    data = read_bounded(path, entry.size)
+    return _checked(shard, manifest, name, shard.read(name, manifest.files[name].size))
+
+
+def _read_files(shard: Folder, manifest: ShardManifest, names: Sequence[str]) -> Iterator[bytes]:
+    contents = shard.read_all([(name, manifest.files[name].size) for name in names])
+    return (_checked(shard, manifest, name, data) for name, data in zip(names, contents, strict=True))
+
+
+def _checked(shard: Folder, manifest: ShardManifest, name: str, data: bytes) -> bytes:
+    path, entry = f"{shard}/{name}", manifest.files[name]
     if len(data) != entry.size:
         raise StoreError(f"{path}: has {len(data)} bytes, the manifest says {entry.size}; restore it from a copy")
     if hashlib.sha256(data).hexdigest() != entry.sha256:
@@ -102,27 +136,28 @@ def read_file(shard: Path, manifest: ShardManifest, name: str) -> bytes:
     return data
 
 
-def read_interactions(shard: Path, manifest: ShardManifest, names: Sequence[str] | None = None) -> Any:
+def read_interactions(shard: Folder, manifest: ShardManifest, names: Sequence[str] | None = None) -> Any:
     """The table of a shard's interactions, or some columns of it."""
     data = read_file(shard, manifest, INTERACTIONS_FILE)
-    return read_table(data, INTERACTION_SCHEMA, manifest.interactions, f"{shard / INTERACTIONS_FILE}", names)
+    return read_table(data, INTERACTION_SCHEMA, manifest.interactions, f"{shard}/{INTERACTIONS_FILE}", names)
 
 
-def read_rollout_table(shard: Path, manifest: ShardManifest) -> Any:
+def read_rollout_table(shard: Folder, manifest: ShardManifest) -> Any:
     """The table of a shard's rollouts."""
     data = read_file(shard, manifest, ROLLOUTS_FILE)
-    return read_table(data, ROLLOUT_SCHEMA, manifest.rollouts, f"{shard / ROLLOUTS_FILE}")
+    return read_table(data, ROLLOUT_SCHEMA, manifest.rollouts, f"{shard}/{ROLLOUTS_FILE}")
 
 
-def read_observations(shard: Path, manifest: ShardManifest) -> ObservationArrays:
+def read_observations(shard: Folder, manifest: ShardManifest) -> ObservationArrays:
     """All clouds of a shard."""
     prefix = f"{OBSERVATIONS_FOLDER}/"
     names = [name for name in manifest.files if name.startswith(prefix)]
-    files = {name.removeprefix(prefix): read_file(shard, manifest, name) for name in names}
-    return observations.decode(files, manifest.observations, manifest.points, str(shard / OBSERVATIONS_FOLDER))
+    contents = _read_files(shard, manifest, names)
+    files = {name.removeprefix(prefix): data for name, data in zip(names, contents, strict=True)}
+    return observations.decode(files, manifest.observations, manifest.points, f"{shard}/{OBSERVATIONS_FOLDER}")
 
 
-def read_rollouts(shard: Path, manifest: ShardManifest) -> tuple[RolloutRecord, ...]:
+def read_rollouts(shard: Folder, manifest: ShardManifest) -> tuple[RolloutRecord, ...]:
     """The records of a shard, bit for bit as they were committed.
 
     Raises:

@@ -7,19 +7,23 @@ clouds = store.read_observations(shard_id)
 """
 
 import difflib
+import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import pyarrow as pa
 from pydantic import ValidationError
 
 from shared.errors import StoreError, UsageError
-from shared.files import TEMPORARY_PREFIX, create_exclusively, read_bounded, remove_if_abandoned
+from shared.files import TEMPORARY_PREFIX
 from shared.plan import Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import policies, reader
+from shared.store.coverage import ROLLOUT_COLUMN, Part, parts_of
 from shared.store.difference import difference_of
 from shared.store.digest import combined_digest
 from shared.store.layout import (
@@ -37,6 +41,7 @@ from shared.store.layout import (
     parse_store_document,
 )
 from shared.store.observations import ObservationArrays
+from shared.store.place import Folder, Place, is_url, place_of
 from shared.store.provenance import software_versions
 from shared.store.sealed import seal, unseal
 from shared.store.tables import INTERACTION_SCHEMA, ROLLOUT_SCHEMA
@@ -44,15 +49,22 @@ from shared.store.writer import commit_shard
 from shared.underway import Underway
 
 MAX_SEED = 2**64 - 1
+DRIVER = "driver"
+"""Whoever hands out jobs."""
 
 
 class Store:
     """A folder of immutable shards, all of one setting. Any number of processes may use it at once."""
 
-    def __init__(self, path: Path, document: StoreDocument) -> None:
+    def __init__(self, place: Place, document: StoreDocument) -> None:
         """Use `Store.create` or `Store.open`."""
-        self.path = path
+        self.place = place
         self.document = document
+
+    @property
+    def where(self) -> str:
+        """What people call the store's place: a folder or a URL; `Store.open` takes it."""
+        return self.place.where
 
     @property
     def setting(self) -> Setting:
@@ -60,43 +72,51 @@ class Store:
         return self.document.setting
 
     @classmethod
-    def create(cls, path: Path, setting: Setting) -> "Store":
+    def create(cls, where: str | Path, setting: Setting) -> "Store":
         """Make a store, or open the one that is there.
 
+        Args:
+            where: a folder, or s3://BUCKET/PREFIX.
+            setting: of all its rows.
+
         Raises:
-            StoreError: a store of another setting is there, or files that are no store, or the folder cannot be made.
-            UsageError: the setting's seed is too large to be stored.
+            StoreError: a store of another setting is there, or files that are no store, or it cannot be made.
+            UsageError: the setting's seed is too large to be stored, or the URL is not allowed.
         """
         if setting.seed > MAX_SEED:
             raise UsageError(f"seed {setting.seed} is too large; allowed: 0 to {MAX_SEED}")
+        place = place_of(where)
         try:
-            path.mkdir(parents=True, exist_ok=True)
-            if not (path / STORE_FILE).exists():
-                _refuse_foreign(path)
+            if not place.exists(STORE_FILE):
+                _refuse_foreign(place)
                 created = datetime.now(UTC).isoformat(timespec="seconds")
                 document = StoreDocument(setting=setting, software=software_versions(), created=created)
-                create_exclusively(path / STORE_FILE, seal(document.model_dump(mode="json")))
+                place.create(STORE_FILE, seal(document.model_dump(mode="json")))
         except OSError as error:
-            raise StoreError(f"{path}: no store can be made here ({error.strerror}); name another folder") from None
-        store = cls.open(path)
+            raise StoreError(f"{where}: no store can be made here ({error.strerror}); name another folder") from None
+        store = cls.open(where)
         if store.setting != setting:
             difference = difference_of(store.setting.model_dump(mode="json"), setting.model_dump(mode="json"))
-            raise StoreError(f"{path} holds another setting: {difference}; give the same, or another folder")
+            raise StoreError(f"{where} holds another setting: {difference}; give the same, or another folder")
         return store
 
     @classmethod
-    def open(cls, path: Path) -> "Store":
+    def open(cls, where: str | Path) -> "Store":
         """Open a store that is there.
+
+        Args:
+            where: a folder, or s3://BUCKET/PREFIX.
 
         Raises:
             StoreError: it is missing, no store, damaged, or of another schema version.
+            UsageError: the URL is not allowed.
         """
-        file = path / STORE_FILE
-        if not path.is_dir():
-            raise StoreError(f"{path}: there is no such folder; name an existing store")
-        if not file.exists():
-            raise StoreError(f"{path}: is no store (it has no {STORE_FILE}); name an existing store")
-        return cls(path, parse_store_document(read_bounded(file, MAX_DOCUMENT_BYTES), str(file)))
+        place = place_of(where)
+        if not place.is_there():
+            raise StoreError(f"{where}: there is no such folder; name an existing store")
+        if not place.exists(STORE_FILE):
+            raise StoreError(f"{where}: is no store (it has no {STORE_FILE}); name an existing store")
+        return cls(place, parse_store_document(place.read(STORE_FILE, MAX_DOCUMENT_BYTES), f"{where}/{STORE_FILE}"))
 
     def add_plan(self, plan: Plan) -> None:
         """Record a plan; recording it again changes nothing.
@@ -106,14 +126,13 @@ class Store:
         """
         if plan.setting != self.setting:
             difference = difference_of(self.setting.model_dump(mode="json"), plan.setting.model_dump(mode="json"))
-            raise StoreError(f"{self.path}: plan {plan.key} is of another setting: {difference}")
-        file = self._plans / f"{plan.key}.json"
-        self._plans.mkdir(exist_ok=True)
-        if not file.exists() and create_exclusively(file, seal(plan.model_dump(mode="json"))):
+            raise StoreError(f"{self.where}: plan {plan.key} is of another setting: {difference}")
+        key = f"{PLANS_FOLDER}/{plan.key}.json"
+        if self.place.create(key, seal(plan.model_dump(mode="json"))):
             return
         # Compared as plans: a setting that came with later software has its default in a file that lacks it.
-        if self.read_plan(file) != plan:
-            raise StoreError(f"{file}: holds another plan of this name; give this one another store")
+        if self.read_plan(f"{plan.key}.json") != plan:
+            raise StoreError(f"{self.where}/{key}: holds another plan of this name; give this one another store")
 
     def plans(self) -> tuple[Plan, ...]:
         """The plans, in order of name.
@@ -121,35 +140,39 @@ class Store:
         Raises:
             StoreError: a file is damaged or foreign.
         """
-        files = sorted(self._plans.glob("[!.]*.json")) if self._plans.is_dir() else []
-        return tuple(self.read_plan(file) for file in files)
+        names = [name for name in self.place.names(PLANS_FOLDER) if not name.startswith(".")]
+        return tuple(self.read_plan(name) for name in names if name.endswith(".json"))
 
-    def read_plan(self, file: Path) -> Plan:
-        """A plan from its file.
+    def read_plan(self, name: str) -> Plan:
+        """A plan from the file of this name.
 
         Raises:
             StoreError: the file is damaged or foreign.
         """
-        data = read_bounded(file, MAX_DOCUMENT_BYTES)
+        key = f"{PLANS_FOLDER}/{name}"
+        file = f"{self.where}/{key}"
+        data = self.place.read(key, MAX_DOCUMENT_BYTES)
         try:
-            plan = Plan.model_validate(unseal(data, str(file)))
+            plan = Plan.model_validate(unseal(data, file))
         except ValidationError:
             raise StoreError(f"{file}: is no plan; the file is damaged or foreign") from None
-        if plan.key != file.stem or plan.setting != self.setting:
+        if f"{plan.key}.json" != name or plan.setting != self.setting:
             raise StoreError(f"{file}: is no plan of this store; the file is damaged or foreign")
         return plan
 
     def committed(self, plan_key: str | None = None) -> list[ShardManifest]:
         """Manifests of the committed shards (of one plan), in order of name; no data are read.
 
+        Shards whose rollouts larger ones hold as well, as a compaction leaves them until it ends, are left out.
+
         Raises:
             StoreError: a manifest is damaged or foreign.
         """
-        return [reader.read_manifest(shard) for shard in reader.committed_shards(self.shards_folder, plan_key)]
+        return [part.manifest for part in self._parts(plan_key)]
 
     def holds(self, job: Job) -> bool:
         """Whether the shard of a job is committed."""
-        return reader.is_committed(self.shards_folder / job.shard_id)
+        return reader.is_committed(reader.shard_folder(self.place, job.shard_id))
 
     def commit(
         self,
@@ -185,20 +208,27 @@ class Store:
                     "is of another object or seed than the store's"
                 )
         points = self.setting.collection.camera.points
-        return commit_shard(self.shards_folder, job, rollouts, points, provenance, quarantined)
+        return commit_shard(self.place, job, rollouts, points, provenance, quarantined)
+
+    def only_driver(self) -> AbstractContextManager[None]:
+        """Hold the store against other drivers, which would do everything twice; in a bucket they may, without harm.
+
+        Raises:
+            UsageError: another driver holds it; the message names the process.
+        """
+        return self.place.only_one(DRIVER)
 
     def sweep(self) -> int:
         """Remove what dead writers left unfinished; returns how many files and folders that was."""
-        folders = [self.path, self._plans, self.shards_folder, self.policies_folder]
-        remnants = [p for folder in folders if folder.is_dir() for p in folder.glob(f"{TEMPORARY_PREFIX}*")]
-        return sum(remove_if_abandoned(remnant) for remnant in remnants) + self.underway.sweep()
+        folders = ["", PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER]
+        return self.place.sweep(folders) + self.underway.sweep()
 
     def digest(self, plan_key: str | None = None) -> str:
         """Content digest of the store, or of one plan: independent of shards, workers, hosts and times."""
         return combined_digest(
-            (manifest.plan_key, index, digest)
-            for manifest in self.committed(plan_key)
-            for index, digest in enumerate(manifest.digests, manifest.start)
+            (part.manifest.plan_key, index, part.manifest.digests[index - part.manifest.start])
+            for part in self._parts(plan_key)
+            for index in range(part.start, part.stop)
         )
 
     def interactions(self, columns: Sequence[str] | None = None, plan_keys: Sequence[str] | None = None) -> Any:
@@ -220,10 +250,8 @@ class Store:
                 hint = f"did you mean '{close[0]}'?" if close else f"allowed: {', '.join(INTERACTION_SCHEMA.names)}"
                 raise UsageError(f"no column '{name}' in the interactions; {hint}")
         schema = pa.schema([INTERACTION_SCHEMA.field(name) for name in names])
-        shards = [m for m in self.committed() if plan_keys is None or m.plan_key in plan_keys]
-        tables = [
-            _with_shard(reader.read_interactions(self._shard(m), m, names).select(names), m.shard_id) for m in shards
-        ]
+        parts = [part for part in self._parts() if plan_keys is None or part.manifest.plan_key in plan_keys]
+        tables = [_with_shard(self._interactions(part, names), part.manifest.shard_id) for part in parts]
         return pa.concat_tables([_with_shard(schema.empty_table(), ""), *tables])
 
     def rollouts(self) -> Any:
@@ -232,7 +260,10 @@ class Store:
         Raises:
             StoreError: a file is damaged or foreign.
         """
-        tables = [_with_shard(reader.read_rollout_table(self._shard(m), m), m.shard_id) for m in self.committed()]
+        tables = [
+            _with_shard(part.of(reader.read_rollout_table(self._shard(part), part.manifest)), part.manifest.shard_id)
+            for part in self._parts()
+        ]
         return pa.concat_tables([_with_shard(ROLLOUT_SCHEMA.empty_table(), ""), *tables])
 
     def read_observations(self, shard_id: str) -> ObservationArrays:
@@ -255,50 +286,73 @@ class Store:
 
     def publish_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """Put a policy's files into the store, all or none; see `shared.store.policies`."""
-        policies.publish_policy(self.policies_folder, version, files)
+        policies.publish_policy(self.place, version, files)
 
     def read_policy(self, version: int) -> dict[str, bytes]:
         """A policy's files, checked; see `shared.store.policies`."""
-        return policies.read_policy(self.policies_folder, version)
+        return policies.read_policy(self.place, version)
 
     def policy_versions(self) -> tuple[int, ...]:
         """The versions that are published, in order."""
-        return policies.policy_versions(self.policies_folder)
+        return policies.policy_versions(self.place)
+
+    @property
+    def path(self) -> Path:
+        """The folder of a store that lies on a disk.
+
+        Raises:
+            UsageError: it lies in a bucket.
+        """
+        if is_url(self.where):
+            raise UsageError(
+                f"{self.where}: lies in no folder; copy it by `adaafford store merge {self.where} --out DIR`"
+            )
+        return Path(self.where)
 
     @property
     def shards_folder(self) -> Path:
-        """Where shards lie."""
+        """Where shards lie; raises as `path` does."""
         return self.path / SHARDS_FOLDER
 
     @property
     def policies_folder(self) -> Path:
-        """Where policies lie."""
+        """Where policies lie; raises as `path` does."""
         return self.path / POLICIES_FOLDER
 
     @property
     def underway(self) -> Underway:
-        """Where workers leave their breadcrumbs."""
+        """Where workers leave their breadcrumbs: in the store, or on this machine if the store is in a bucket."""
+        if is_url(self.where):
+            return Underway(
+                Path(gettempdir()) / f"adaafford-underway-{hashlib.sha256(self.where.encode()).hexdigest()[:16]}"
+            )
         return Underway(self.path / UNDERWAY_FOLDER)
 
-    @property
-    def _plans(self) -> Path:
-        return self.path / PLANS_FOLDER
+    def _parts(self, plan_key: str | None = None) -> list[Part]:
+        """What of which shard counts."""
+        return parts_of(reader.read_manifests(reader.committed_shards(self.place, plan_key)))
 
-    def _shard(self, manifest: ShardManifest) -> Path:
-        return self.shards_folder / manifest.shard_id
+    def _interactions(self, part: Part, names: Sequence[str]) -> Any:
+        """Some columns of the rows that count."""
+        wanted = names if part.is_whole else [*names, ROLLOUT_COLUMN]
+        return part.of(reader.read_interactions(self._shard(part), part.manifest, wanted)).select(names)
 
-    def _committed_shard(self, shard_id: str) -> Path:
-        if parse_shard_id(shard_id) is None or not reader.is_committed(self.shards_folder / shard_id):
-            raise StoreError(f"{self.path}: holds no committed shard {shard_id[:80]!r}; see `store info`")
-        return self.shards_folder / shard_id
+    def _shard(self, part: Part) -> Folder:
+        return reader.shard_folder(self.place, part.manifest.shard_id)
+
+    def _committed_shard(self, shard_id: str) -> Folder:
+        folder = reader.shard_folder(self.place, shard_id)
+        if parse_shard_id(shard_id) is None or not reader.is_committed(folder):
+            raise StoreError(f"{self.where}: holds no committed shard {shard_id[:80]!r}; see `store info`")
+        return folder
 
 
-def _refuse_foreign(path: Path) -> None:
+def _refuse_foreign(place: Place) -> None:
     """Refuse a folder that holds anything but what another process, creating at this moment, may have put there."""
-    for entry in path.iterdir():
+    for name in place.names(""):
         # The other process may have finished since, and its first shard may be there.
-        if not entry.name.startswith((TEMPORARY_PREFIX, LOCK_PREFIX)) and not (path / STORE_FILE).exists():
-            raise StoreError(f"{path}: is not empty and no store (it holds {entry.name!r}); name an empty folder")
+        if not name.startswith((TEMPORARY_PREFIX, LOCK_PREFIX)) and not place.exists(STORE_FILE):
+            raise StoreError(f"{place.where}: is not empty and no store (it holds {name!r}); name an empty folder")
 
 
 def _with_shard(table: Any, shard_id: str) -> Any:

@@ -1,9 +1,8 @@
 """Verification: everything that a store claims, recomputed from its bytes."""
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from shared.store import reader
 from shared.store.columns import COPIED_COLUMNS, INTERACTION_COLUMNS, InteractionRow
 from shared.store.digest import rollout_digest
 from shared.store.layout import (
+    ASIDE_FOLDER,
     LOCK_PREFIX,
     MANIFEST_FILE,
     PLANS_FOLDER,
@@ -24,6 +24,7 @@ from shared.store.layout import (
     ShardManifest,
     parse_shard_id,
 )
+from shared.store.place import Folder
 from shared.store.policies import INDEX_FILE, folder_name
 from shared.store.store import Store
 from shared.store.tables import column_values
@@ -49,8 +50,8 @@ def verify(store: Store, progress: Callable[[int, int], None] | None = None) -> 
         store: which one.
         progress: called after each shard with how many are done and how many there are.
     """
-    problems = [*_plans_and_policies(store), *_strangers(store)]
-    shards = list(reader.committed_shards(store.shards_folder))
+    shards = reader.committed_shards(store.place)
+    problems = [*_plans_and_policies(store, shards), *_strangers(store, shards)]
     sound = []
     for done, shard in enumerate(shards, 1):
         try:
@@ -58,38 +59,36 @@ def verify(store: Store, progress: Callable[[int, int], None] | None = None) -> 
             sound.append(manifest)
             problems += _shard(store, shard, manifest)
         except StoreError as error:
-            problems.append(_problem(store, shard, str(error)))
+            problems.append(_problem(shard.key, str(error), store))
         if progress is not None:
             progress(done, len(shards))
-    return problems + list(_overlaps(store, sound))
+    return problems + list(_overlaps(sound))
 
 
-def _shard(store: Store, shard: Path, manifest: ShardManifest) -> Iterator[Problem]:
+def _shard(store: Store, shard: Folder, manifest: ShardManifest) -> Iterator[Problem]:
     """Problems of one shard; the first damaged file of it hides later checks."""
-    yield from _strangers_in_shard(store, shard, manifest)
+    yield from _strangers_in_shard(shard, manifest)
     damaged = False
     for name in manifest.files:
         try:
             reader.read_file(shard, manifest, name)
         except StoreError as error:
             damaged = True
-            yield _problem(store, shard / name, str(error))
+            yield _problem(f"{shard.key}/{name}", str(error), store)
     if damaged:
         return
     rollouts = reader.read_rollouts(shard, manifest)
     for rollout, digest in zip(rollouts, manifest.digests, strict=True):
         if rollout_digest(rollout) != digest:
-            yield _problem(store, shard, f"rollout {rollout.index} is not the one whose digest the manifest states")
+            yield _problem(shard.key, f"rollout {rollout.index} is not the one whose digest the manifest states")
     known = set(store.setting.objects)
     for rollout in rollouts:
         if rollout.object not in known or rollout.seed != store.setting.seed:
-            yield _problem(store, shard, f"rollout {rollout.index} is of another object or seed than the store's")
-    yield from _copies(store, shard, manifest, rollouts)
+            yield _problem(shard.key, f"rollout {rollout.index} is of another object or seed than the store's")
+    yield from _copies(shard, manifest, rollouts)
 
 
-def _copies(
-    store: Store, shard: Path, manifest: ShardManifest, rollouts: tuple[RolloutRecord, ...]
-) -> Iterator[Problem]:
+def _copies(shard: Folder, manifest: ShardManifest, rollouts: tuple[RolloutRecord, ...]) -> Iterator[Problem]:
     """Columns that repeat or restate others must agree with them."""
     firsts = np.cumsum([0, *(len(rollout.observations) for rollout in rollouts)]).tolist()
     rows = [InteractionRow(r, i, first) for r, first in zip(rollouts, firsts, strict=False) for i in r.interactions]
@@ -103,69 +102,78 @@ def _copies(
         else:
             agree = list(cells.texts) == kept
         if not agree:
-            yield _problem(store, shard, f"column {column.name} does not agree with the columns that it restates")
+            yield _problem(shard.key, f"column {column.name} does not agree with the columns that it restates")
 
 
-def _plans_and_policies(store: Store) -> Iterator[Problem]:
-    plans = store.path / PLANS_FOLDER
+def _plans_and_policies(store: Store, shards: Sequence[Folder]) -> Iterator[Problem]:
     known = {}
-    for file in sorted(plans.iterdir()) if plans.is_dir() else []:
-        if file.name.startswith(TEMPORARY_PREFIX):
+    for name in store.place.names(PLANS_FOLDER):
+        if name.startswith(TEMPORARY_PREFIX):
             continue
         try:
-            plan = store.read_plan(file)
+            plan = store.read_plan(name)
             known[plan.key] = plan
         except StoreError as error:
-            yield _problem(store, file, str(error))
+            yield _problem(f"{PLANS_FOLDER}/{name}", str(error), store)
     versions = set(store.policy_versions())
     for version in sorted(versions | {plan.policy_version for plan in known.values()} - {0}):
-        folder = store.policies_folder / folder_name(version)
+        folder = f"{POLICIES_FOLDER}/{folder_name(version)}"
         try:
             files = store.read_policy(version)
-            for entry in folder.iterdir():
-                if entry.name not in (*files, INDEX_FILE):
-                    yield _problem(store, entry, "no file of this policy; remove it")
+            for name in store.place.names(folder):
+                if name not in (*files, INDEX_FILE):
+                    yield _problem(f"{folder}/{name}", "no file of this policy; remove it")
         except StoreError as error:
-            yield _problem(store, folder, str(error))
-    for key in sorted({shard.name.rsplit("-", 2)[0] for shard in reader.committed_shards(store.shards_folder)}):
+            yield _problem(folder, str(error), store)
+    for key in sorted({shard.name.rsplit("-", 2)[0] for shard in shards}):
         if key not in known:
-            yield _problem(store, plans / f"{key}.json", "shards of this plan exist, but no sound plan")
+            yield _problem(f"{PLANS_FOLDER}/{key}.json", "shards of this plan exist, but no sound plan")
 
 
-def _strangers(store: Store) -> Iterator[Problem]:
+def _strangers(store: Store, shards: Sequence[Folder]) -> Iterator[Problem]:
     """Files and folders that the store did not make, and shards that were never committed."""
-    ours = {STORE_FILE, PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER, UNDERWAY_FOLDER}
+    ours = {STORE_FILE, PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER, UNDERWAY_FOLDER, ASIDE_FOLDER}
     passing = (TEMPORARY_PREFIX, LOCK_PREFIX)
-    for entry in sorted(store.path.iterdir()):
-        if entry.name not in ours and not entry.name.startswith(passing):
-            yield _problem(store, entry, "no part of a store; remove it")
-    versions = {folder_name(version) for version in store.policy_versions()}
-    for entry in sorted(store.policies_folder.iterdir()) if store.policies_folder.is_dir() else []:
-        if entry.name not in versions and not entry.name.startswith(passing):
-            yield _problem(store, entry, "no policy; remove it")
-    for entry in sorted(store.shards_folder.iterdir()) if store.shards_folder.is_dir() else []:
-        if parse_shard_id(entry.name) is None:
-            if not entry.name.startswith(passing):
-                yield _problem(store, entry, "no shard; remove it")
-        elif not reader.is_committed(entry):
-            yield _problem(store, entry, "has no manifest, so counts for nothing; collecting again replaces it")
+    for name in store.place.names(""):
+        if name not in ours and not name.startswith(passing):
+            yield _problem(name, "no part of a store; remove it")
+    for name in store.place.names(POLICIES_FOLDER):
+        if not re.fullmatch(r"[0-9]{6}", name) and not name.startswith(passing):
+            yield _problem(f"{POLICIES_FOLDER}/{name}", "no policy; remove it")
+    committed = {shard.name for shard in shards}
+    for name in store.place.names(SHARDS_FOLDER):
+        if parse_shard_id(name) is None:
+            if not name.startswith(passing):
+                yield _problem(f"{SHARDS_FOLDER}/{name}", "no shard; remove it")
+        elif name not in committed and not store.place.writes_in_place:
+            where = f"{SHARDS_FOLDER}/{name}"
+            yield _problem(where, "has no manifest, so counts for nothing; collecting again replaces it")
 
 
-def _strangers_in_shard(store: Store, shard: Path, manifest: ShardManifest) -> Iterator[Problem]:
-    ours = {MANIFEST_FILE, *manifest.files}
-    folders = {str(parent) for name in ours for parent in Path(name).parents}
-    for entry in sorted(shard.rglob("*")):
-        if str(entry.relative_to(shard)) not in ours | folders:
-            yield _problem(store, entry, "no file of this shard; remove it")
+def _strangers_in_shard(shard: Folder, manifest: ShardManifest) -> Iterator[Problem]:
+    ours = {f"{shard.key}/{name}" for name in (MANIFEST_FILE, *manifest.files)}
+    for key in shard.place.leaves(shard.key):
+        if key not in ours:
+            yield _problem(key, "no file of this shard; remove it")
 
 
-def _overlaps(store: Store, manifests: list[ShardManifest]) -> Iterator[Problem]:
-    """Shards that hold the same rollout of a plan: its rows would count twice."""
-    for one, next_one in pairwise(sorted(manifests, key=lambda m: (m.plan_key, m.start, m.stop))):
-        if one.plan_key == next_one.plan_key and next_one.start < one.stop:
-            where = store.shards_folder / next_one.shard_id
-            yield _problem(store, where, f"holds rollouts that {one.shard_id} holds too; remove one of the two")
+def _overlaps(manifests: Sequence[ShardManifest]) -> Iterator[Problem]:
+    """Shards that hold the same rollout of a plan; one that another holds wholly, and alike, awaits compaction."""
+    digests: dict[tuple[str, int], tuple[str, ShardManifest]] = {}
+    reach: dict[str, ShardManifest] = {}
+    for one in sorted(manifests, key=lambda m: (m.plan_key, m.start, -m.stop)):
+        before = reach.get(one.plan_key)
+        if before is None or one.stop > before.stop:
+            reach[one.plan_key] = one
+        alike = all(
+            digests.setdefault((one.plan_key, index), (digest, one))[0] == digest
+            for index, digest in enumerate(one.digests, one.start)
+        )
+        if before is not None and one.start < before.stop and not (alike and one.stop <= before.stop):
+            where = f"{SHARDS_FOLDER}/{one.shard_id}"
+            yield _problem(where, f"holds rollouts that {before.shard_id} holds too; run `adaafford store repair`")
 
 
-def _problem(store: Store, path: Path, what: str) -> Problem:
-    return Problem(str(path.relative_to(store.path)), what.removeprefix(f"{path}: "))
+def _problem(where: str, what: str, store: Store | None = None) -> Problem:
+    """A problem; what an error says of its own place is not said twice."""
+    return Problem(where, what if store is None else what.removeprefix(f"{store.where}/{where}: "))

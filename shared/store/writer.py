@@ -1,11 +1,9 @@
-"""Committing shards: written beside, forced to the disk, manifest last, renamed into place."""
+"""Committing shards: all files of one, and its manifest last; the place knows how that is made all or nothing."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Collection, Mapping, Sequence
 
 from shared.errors import StoreError
-from shared.files import exclusive_lock, remove_tree, sync_folder, temporary_name, write_durably
 from shared.plan import Job
 from shared.records import RolloutRecord
 from shared.store import observations
@@ -13,7 +11,6 @@ from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, Interacti
 from shared.store.digest import rollout_digest
 from shared.store.layout import (
     INTERACTIONS_FILE,
-    LOCK_PREFIX,
     MANIFEST_FILE,
     OBSERVATIONS_FOLDER,
     ROLLOUTS_FILE,
@@ -22,51 +19,66 @@ from shared.store.layout import (
     ShardManifest,
     parse_shard_id,
 )
+from shared.store.place import Folder, Place, Publication
 from shared.store.provenance import process_provenance, software_versions
-from shared.store.reader import is_committed, read_manifest
+from shared.store.reader import (
+    is_committed,
+    read_manifest,
+    read_rollouts,
+    shard_folder,
+    shard_folders,
+)
 from shared.store.sealed import seal
 from shared.store.tables import table_bytes
 from shared.store.validity import check_rollouts
 
-_LOCK_WAIT_S = 60.0
-"""Locks are held for milliseconds; one that lasts longer means a hung disk."""
-
 
 def commit_shard(
-    shards: Path,
+    place: Place,
     job: Job,
     rollouts: Sequence[RolloutRecord],
     points: int,
     provenance: Mapping[str, str],
     quarantined: Sequence[Quarantined],
+    supersedes: Collection[str] = (),
 ) -> ShardManifest:
     """Write a shard and commit it; where another worker was faster, its shard stays and its manifest is returned.
 
     Args:
-        shards: the folder of shards.
+        place: of the store.
         job: the rollouts that the shard holds.
         rollouts: in order.
         points: N, of every cloud.
         provenance: what else is known of how they were made, such as seconds by stage.
         quarantined: why rollouts of that status are.
+        supersedes: shards whose rollouts this one holds too, and that it may overlap.
 
     Raises:
         StoreError: a rollout breaks the rules of a record, or the job overlaps another shard of its plan.
     """
-    final = shards / job.shard_id
-    if is_committed(final):
-        return read_manifest(final)
+    shard = shard_folder(place, job.shard_id)
+    if is_committed(shard):
+        return read_manifest(shard)
     check_rollouts(rollouts, job, points, job.shard_id)
     files = _encode(rollouts, points)
-    manifest = _describe(job, rollouts, files, points, provenance, quarantined)
-    shards.mkdir(exist_ok=True)
-    temporary = shards / temporary_name(job.shard_id)
-    try:
-        _write_files(temporary, files, seal(manifest.model_dump(mode="json")))
-        return manifest if _move_into_place(temporary, job) else read_manifest(final)
-    finally:
-        # After success this name is gone; after a lost race, or an error, what lies here is of no use.
-        remove_tree(temporary)
+
+    def describe(held: Mapping[str, bytes]) -> bytes:
+        manifest = _describe(job, rollouts, held, points, provenance, quarantined)
+        if held != files:
+            _check_taken_over(shard, manifest)
+        return seal(manifest.model_dump(mode="json"))
+
+    place.publish(
+        Publication(
+            folder=shard.key,
+            files=files,
+            mark=MANIFEST_FILE,
+            describe=describe,
+            admit=lambda: _refuse_overlap(place, job, supersedes),
+            lock=job.plan_key,
+        )
+    )
+    return read_manifest(shard)
 
 
 def _encode(rollouts: Sequence[RolloutRecord], points: int) -> dict[str, bytes]:
@@ -107,46 +119,17 @@ def _describe(
     )
 
 
-def _write_files(folder: Path, files: Mapping[str, bytes], manifest: bytes) -> None:
-    folder.mkdir()
-    folders = {folder}
-    for name, data in files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(path, data)
-        folders |= {parent for parent in path.parents if parent.is_relative_to(folder)}
-    for parent in sorted(folders, reverse=True):
-        sync_folder(parent)
-    write_durably(folder / MANIFEST_FILE, manifest)
-    sync_folder(folder)
+def _check_taken_over(shard: Folder, manifest: ShardManifest) -> None:
+    """Files of another attempt at the same job hold the same rollouts, though not the same wall times."""
+    digests = tuple(rollout_digest(rollout) for rollout in read_rollouts(shard, manifest))
+    if digests != manifest.digests:
+        raise StoreError(f"{shard}: files of another attempt lie here, of other content; run `adaafford store repair`")
 
 
-def _move_into_place(temporary: Path, job: Job) -> bool:
-    """Rename a finished shard to its name; False where a committed one has it already.
-
-    Raises:
-        StoreError: another shard of the plan holds some of the same rollouts.
-    """
-    shards, final = temporary.parent, temporary.parent / job.shard_id
-    # The lock makes one step of looking for overlaps and remnants and of renaming; the data were written without it.
-    with exclusive_lock(shards / f"{LOCK_PREFIX}{job.plan_key}", _LOCK_WAIT_S):
-        if is_committed(final):
-            return False
-        _refuse_overlap(shards, job)
-        if final.exists():
-            # An uncommitted folder of this name: half a copy, say. Set aside under a name that a sweep may remove.
-            remnant = shards / temporary_name(job.shard_id)
-            final.rename(remnant)
-            remove_tree(remnant)
-        temporary.rename(final)
-        sync_folder(shards)
-    return True
-
-
-def _refuse_overlap(shards: Path, job: Job) -> None:
-    for path in shards.iterdir():
-        other = parse_shard_id(path.name)
-        if other is None or other == job or other.plan_key != job.plan_key or not is_committed(path):
+def _refuse_overlap(place: Place, job: Job, supersedes: Collection[str]) -> None:
+    for folder in shard_folders(place, job.plan_key):
+        other = parse_shard_id(folder.name)
+        if other is None or other == job or folder.name in supersedes:
             continue
-        if other.start < job.stop and job.start < other.stop:
-            raise StoreError(f"{job.shard_id}: overlaps the committed shard {path.name}; plan only missing rollouts")
+        if other.start < job.stop and job.start < other.stop and is_committed(folder):
+            raise StoreError(f"{job.shard_id}: overlaps the committed shard {folder.name}; plan only missing rollouts")

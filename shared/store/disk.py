@@ -1,0 +1,147 @@
+"""A store in a folder of a disk: written beside, forced to the disk, renamed into place."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+
+from shared.errors import StoreError
+from shared.files import (
+    TEMPORARY_PREFIX,
+    create_exclusively,
+    exclusive_lock,
+    read_bounded,
+    remove_if_abandoned,
+    remove_tree,
+    sync_folder,
+    temporary_name,
+    write_durably,
+)
+from shared.store.layout import LOCK_PREFIX
+from shared.store.place import Publication
+
+_LOCK_WAIT_S = 60.0
+"""Locks are held for milliseconds; one that lasts longer means a hung disk."""
+
+
+class DiskPlace:
+    """See `shared.store.place.Place`."""
+
+    writes_in_place = False
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.where = str(root)
+
+    def is_there(self) -> bool:
+        """See `Place.is_there`."""
+        return self.root.is_dir()
+
+    def read(self, key: str, limit: int) -> bytes:
+        """See `Place.read`; what is reached through a symbolic link below the first level is refused."""
+        parts = PurePosixPath(key).parts
+        for depth in range(2, len(parts)):
+            # A link could lead anywhere. The first level may be one: a disk of its own for the shards, say.
+            if self.root.joinpath(*parts[:depth]).is_symlink():
+                raise StoreError(f"{self._at(key)}: reached through a symbolic link; replace it by the folder itself")
+        return read_bounded(self._at(key), limit)
+
+    def read_all(self, wanted: Sequence[tuple[str, int]]) -> Iterator[bytes]:
+        """See `Place.read_all`."""
+        return (self.read(key, limit) for key, limit in wanted)
+
+    def exists(self, key: str) -> bool:
+        """See `Place.exists`."""
+        return self._at(key).exists()
+
+    def exist(self, keys: Sequence[str]) -> Iterator[bool]:
+        """See `Place.exist`."""
+        return map(self.exists, keys)
+
+    def names(self, folder: str) -> list[str]:
+        """See `Place.names`."""
+        path = self._at(folder)
+        return sorted(entry.name for entry in path.iterdir()) if path.is_dir() else []
+
+    def leaves(self, folder: str) -> list[str]:
+        """See `Place.leaves`."""
+        entries = [(p, p.is_dir() and not p.is_symlink()) for p in self._at(folder).rglob("*")]
+        full = {path.parent for path, _ in entries}
+        return sorted(
+            path.relative_to(self.root).as_posix() for path, is_dir in entries if not is_dir or path not in full
+        )
+
+    def create(self, key: str, data: bytes) -> bool:
+        """See `Place.create`."""
+        path = self._at(key)
+        if path.exists():
+            return False
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return create_exclusively(path, data)
+
+    def publish(self, publication: Publication) -> bool:
+        """See `Place.publish`."""
+        final = self._at(publication.folder)
+        final.parent.mkdir(exist_ok=True)
+        temporary = final.parent / temporary_name(final.name)
+        try:
+            _write_files(temporary, publication.files, publication.mark, publication.describe(publication.files))
+            return self._move_into_place(temporary, final, publication)
+        finally:
+            # After success this name is gone; after a lost race, or an error, what lies here is of no use.
+            remove_tree(temporary)
+
+    def move(self, key: str, new: str) -> None:
+        """See `Place.move`."""
+        old, target = self._at(key), self._at(new)
+        if not old.exists() and not old.is_symlink():
+            return
+        target.parent.mkdir(parents=True, exist_ok=True)
+        old.rename(target)
+        sync_folder(target.parent)
+        sync_folder(old.parent)
+
+    def sweep(self, folders: Sequence[str]) -> int:
+        """See `Place.sweep`."""
+        paths = [self._at(folder) for folder in folders]
+        remnants = [path for folder in paths if folder.is_dir() for path in folder.glob(f"{TEMPORARY_PREFIX}*")]
+        return sum(remove_if_abandoned(remnant) for remnant in remnants)
+
+    @contextmanager
+    def only_one(self, name: str) -> Iterator[None]:
+        """See `Place.only_one`."""
+        with exclusive_lock(self.root / f"{LOCK_PREFIX}{name}"):
+            yield
+
+    def _at(self, key: str) -> Path:
+        return self.root / key
+
+    def _move_into_place(self, temporary: Path, final: Path, publication: Publication) -> bool:
+        """Rename a finished folder to its name; False where a published one has it already."""
+        folder = final.parent
+        # The lock makes one step of looking at what is there and of renaming; the data were written without it.
+        with exclusive_lock(folder / f"{LOCK_PREFIX}{publication.lock}", _LOCK_WAIT_S):
+            if (final / publication.mark).exists():
+                return False
+            publication.admit()
+            if final.exists():
+                # A folder of this name without its mark: half a copy, say. Under this name a sweep may remove it.
+                remnant = folder / temporary_name(final.name)
+                final.rename(remnant)
+                remove_tree(remnant)
+            temporary.rename(final)
+            sync_folder(folder)
+        return True
+
+
+def _write_files(folder: Path, files: Mapping[str, bytes], mark: str, description: bytes) -> None:
+    folder.mkdir()
+    folders = {folder}
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, data)
+        folders |= {parent for parent in path.parents if parent.is_relative_to(folder)}
+    for parent in sorted(folders, reverse=True):
+        sync_folder(parent)
+    write_durably(folder / mark, description)
+    sync_folder(folder)
