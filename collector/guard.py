@@ -69,10 +69,7 @@ class Guard:
 
     @contextmanager
     def job(self, job: Job) -> Iterator[UnderWay]:
-        """Gives what to call before each rollout of a job.
-
-        After an exception the breadcrumb stays, since it says whose it was; whoever takes it up removes it.
-        """
+        """Gives what to call before each rollout of a job; the breadcrumb stays until the next, or the process's end."""
 
         def under_way(rollout: int | None) -> None:
             self._underway.leave(Crumb(shard_id=job.shard_id, rollout=rollout))
@@ -82,4 +79,3 @@ class Guard:
             yield under_way
         finally:
             faulthandler.cancel_dump_traceback_later()
-        self._underway.clear()

@@ -8,6 +8,7 @@ wrote it, so that none is ever taken for another's, however many have tried the 
 the disk: a breadcrumb matters after the end of a process, not of a machine.
 """
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from shared.errors import StoreError
 from shared.files import is_gone, process_name, read_bounded
 
 _CRUMB, _FAULT = ".json", ".fault"
+_CRUMB_BYTES = 256
 _MAX_BYTES = 1 << 16
 _FRAMES = 2
 """Frames of a traceback that a reason names, from the innermost outwards."""
@@ -33,7 +35,7 @@ class Crumb(StrictModel):
     shard_id: str = Field(max_length=100)
     """Of the job."""
     rollout: int | None = Field(ge=0)
-    """The one under way; None before the first and after the last."""
+    """The one under way; None while the shard is written, and after that until the next job."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +57,13 @@ class Underway:
         """
         file = self._file(process_name(), _CRUMB)
         try:
-            file.write_bytes(crumb.model_dump_json().encode())
+            _overwrite(file, crumb.model_dump_json().encode())
         except FileNotFoundError:
             self.folder.mkdir(exist_ok=True)
-            file.write_bytes(crumb.model_dump_json().encode())
+            _overwrite(file, crumb.model_dump_json().encode())
         except OSError:
             file.unlink(missing_ok=True)
             raise
-
-    def clear(self) -> None:
-        """Say that this process does nothing."""
-        self._file(process_name(), _CRUMB).unlink(missing_ok=True)
 
     def open_fault_log(self) -> IO[bytes]:
         """A file for the last words of this process, as `faulthandler` writes them."""
@@ -106,6 +104,18 @@ class Underway:
             return read_bounded(self._file(process, suffix), _MAX_BYTES)
         except StoreError:
             return b""
+
+
+def _overwrite(file: Path, data: bytes) -> None:
+    """Put a breadcrumb in the place of the last one."""
+    # Neither truncated nor renamed over: file systems take either for a wish to have it on the disk at once, which
+    # costs milliseconds. Blanks cover what was there before, and JSON ignores them.
+    assert len(data) <= _CRUMB_BYTES
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+    try:
+        os.write(descriptor, data.ljust(_CRUMB_BYTES))
+    finally:
+        os.close(descriptor)
 
 
 def summary_of(words: str) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -155,7 +156,9 @@ def test_a_breadcrumb_says_what_its_process_does(tmp_path: Path) -> None:
     underway.leave(Crumb(shard_id=JOB.shard_id, rollout=6))
     assert underway.crumb_of(process_name()) == Crumb(shard_id=JOB.shard_id, rollout=6)
     assert underway.sweep() == 0, "this process is alive"
-    underway.clear()
+    underway.leave(Crumb(shard_id="aip-v1-00000000-00000001", rollout=None))
+    assert underway.crumb_of(process_name()) == Crumb(shard_id="aip-v1-00000000-00000001", rollout=None)
+    underway.forget(process_name())
     assert underway.crumb_of(process_name()) is None
 
 
@@ -202,7 +205,7 @@ def test_last_words_come_to_one_line() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(600)
 def test_crashes_hangs_and_kills_cost_themselves_alone_on_ray(tmp_path: Path) -> None:
     mishaps = {1: "crash", 6: "hang", 7: "raise", 10: "kill"}
     disturbed, undisturbed = new_store(tmp_path / "disturbed"), new_store(tmp_path / "undisturbed")
@@ -217,3 +220,18 @@ def test_crashes_hangs_and_kills_cost_themselves_alone_on_ray(tmp_path: Path) ->
     assert reasons[6].startswith("took more than 0:00:02, in execute (misbehaving_worker.py:")
     assert reasons[7] == "RuntimeError: the engine exploded (3 times)"
     assert reasons[10].startswith("its process was lost without a word")
+
+
+def test_a_replayed_rollout_crashes_before_ones_eyes(tmp_path: Path) -> None:
+    store = new_store(tmp_path)
+    fill(store, {5: "raise"})
+    script = (
+        "import ctypes, sys, collector.worker; from cluster.cli import run\n"
+        "collector.worker.Worker.execute = lambda self, plan, index, clock: ctypes.string_at(0)\n"
+        "sys.exit(run(sys.argv[1:]))"
+    )
+    arguments = ["store", "replay", str(tmp_path), JOB.shard_id, "--objects", "objects", "--rollout", "5"]
+    done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, timeout=60)
+    assert done.returncode == -signal.SIGSEGV
+    assert "Fatal Python error: Segmentation fault" in done.stderr
+    assert "in _replay" in done.stderr
