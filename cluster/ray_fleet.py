@@ -152,9 +152,9 @@ class RayFleet:
                 raise error.cause from None
             self._fail(seat, waiting, blame, describe(error.cause or error), fault=True)
             return
-        except RayError as error:
+        except RayError:
             words = self._underway.fault_of(seat.process)
-            self._fail(seat, waiting, blame, words or f"{LOST} ({type(error).__name__})", fault=bool(words))
+            self._fail(seat, waiting, blame, words or LOST, fault=bool(words))
             return
         if seat.arrival is not None:
             seat.arrival, seat.process, seat.busy_since = None, message, time.monotonic()
