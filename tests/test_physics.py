@@ -1,10 +1,16 @@
 """Laws that the simulated world must obey, on objects whose right answers are known by hand."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from collector.articulation import ArticulatedObject
+from collector.partnet import read_object
 from collector.primitives import Trial, hand_start, trajectory
+from collector.procedural import generate
 from collector.scene import Scene, restricted_limits
 from shared.configuration import FIDELITIES
 from shared.geometry import gripper_rotation
@@ -31,26 +37,72 @@ def act(
     return Trial(scene, action, 1, primitive, FAST).run()
 
 
-def slide_under(force: float, friction: float, mass: float = 0.5, seconds: float = 0.5) -> float:
-    """How far the free drawer goes under a constant force along its axis."""
-    scene = Scene(drawer(), HiddenDynamics(mass, friction, 1.0), FAST)
+@dataclass(frozen=True)
+class Free:
+    """An object whose one part nothing hinders, and how hard it is to move.
+
+    Attributes:
+        make: makes it.
+        inertia: of the part about its joint for each kg of its mass: 1 if it slides, m^2 if it turns.
+    """
+
+    make: Callable[[], ArticulatedObject]
+    inertia: float
+
+
+FREE = {
+    "prismatic": Free(drawer, 1.0),
+    # A slab of 0.6 x 0.02 about its edge.
+    "revolute": Free(door, 0.6**2 / 3 + 0.02**2 / 3),
+}
+
+
+def move_under(
+    target: ArticulatedObject,
+    effort: float,
+    friction: float,
+    mass: float = 0.5,
+    seconds: float = 0.5,
+    speed: float = 0.0,
+) -> np.ndarray:
+    """Joint position after each step under a constant effort (N or N m) on the joint, from rest or from a speed."""
+    scene = Scene(target, HiddenDynamics(mass, friction, 1.0), FAST)
     scene.put(np.zeros(1))
+    scene._articulation.set_qvel(np.array([speed], dtype=np.float32))
+    positions = []
     for _ in range(round(seconds * FAST.steps_per_second)):
-        scene._articulation.set_qf(np.array([force], dtype=np.float32))
+        scene._articulation.set_qf(np.array([effort], dtype=np.float32))
         scene.system.step()
-    return float(scene.joint_positions()[0])
+        positions.append(float(scene.joint_positions()[0]))
+    return np.array(positions)
 
 
-def test_a_joint_stays_below_its_friction_limit_and_slides_above_it() -> None:
-    assert slide_under(force=0.95, friction=1.0) < 1e-3
-    # Five per cent above the limit a mass of 0.5 accelerates at 0.1: 0.0125 in half a second.
-    assert slide_under(force=1.05, friction=1.0) == pytest.approx(0.0125, rel=0.05)
+@pytest.mark.parametrize("kind", FREE)
+def test_a_joint_stays_below_its_friction_limit_and_slides_above_it(kind: str) -> None:
+    free = FREE[kind]
+    assert move_under(free.make(), effort=0.95, friction=1.0)[-1] < 1e-3
+    # What is left above the limit accelerates the part for half a second.
+    expected = 0.5 * 0.05 / (0.5 * free.inertia) * 0.5**2
+    assert move_under(free.make(), effort=1.05, friction=1.0)[-1] == pytest.approx(expected, rel=0.05)
 
 
-def test_twice_the_mass_halves_the_acceleration() -> None:
-    light, heavy = (slide_under(force=0.2, friction=0.0, mass=mass) for mass in (0.25, 0.5))
+@pytest.mark.parametrize("kind", FREE)
+def test_twice_the_mass_halves_the_acceleration(kind: str) -> None:
+    free = FREE[kind]
+    light, heavy = (move_under(free.make(), effort=0.2, friction=0.0, mass=mass)[-1] for mass in (0.25, 0.5))
     assert light == pytest.approx(2 * heavy, rel=0.02)
-    assert heavy == pytest.approx(0.5 * (0.2 / 0.5) * 0.25, rel=0.02)
+    assert heavy == pytest.approx(0.5 * 0.2 / (0.5 * free.inertia) * 0.5**2, rel=0.02)
+
+
+@pytest.mark.parametrize("kind", FREE)
+def test_friction_takes_the_energy_that_it_says_and_none_is_gained(kind: str) -> None:
+    free, mass, friction, speed = FREE[kind], 0.5, 0.2, 0.4
+    coasting = np.diff(move_under(free.make(), 0.0, 0.0, mass, seconds=1.0, speed=speed), prepend=0.0)
+    assert coasting.max() <= coasting[0] * (1 + 1e-4)
+    sliding = move_under(free.make(), 0.0, friction, mass, seconds=2.0, speed=speed)
+    assert np.diff(sliding).max() <= speed / FAST.steps_per_second
+    assert sliding[-1] == pytest.approx(0.5 * mass * free.inertia * speed**2 / friction, rel=0.05)
+    assert abs(sliding[-1] - sliding[-60]) < 1e-5
 
 
 def test_a_push_moves_a_free_drawer_as_far_as_the_hand_goes() -> None:
@@ -65,9 +117,10 @@ def test_a_push_moves_a_free_drawer_as_far_as_the_hand_goes() -> None:
 def test_a_locked_joint_never_moves() -> None:
     locked = HiddenDynamics(part_mass=0.2, joint_friction=1e4, surface_friction=1.0)
     for primitive in Primitive:
-        outcome = act(drawer(), (0.0, 0.0, 0.0), primitive, locked)
-        assert outcome.motion < 1e-3
-        assert not outcome.success
+        for target, point in ((drawer(), (0.0, 0.0, 0.0)), (door(), (-0.32, -0.295, 0.0))):
+            outcome = act(target, point, primitive, locked)
+            assert outcome.motion < 1e-3
+            assert not outcome.success
 
 
 def test_a_closed_door_cannot_be_pushed_open_but_an_open_one_can_be_pushed_shut() -> None:
@@ -126,6 +179,24 @@ def test_less_surface_friction_makes_a_sideways_push_slip() -> None:
     assert slips.motion < 1e-3
 
 
+def test_less_surface_friction_makes_a_slanted_push_slip() -> None:
+    # The hand comes down on the top at 45 deg, aimed 0.005 below it, the way that the drawer slides.
+    drags, slips = (
+        act(
+            drawer(),
+            (0.2, 0.0, 0.195),
+            dynamics=HiddenDynamics(0.2, 1.5, friction),
+            approach=np.array([1.0, 0.0, -1.0]) / np.sqrt(2),
+            forward=(1.0, 0.0, 1.0),
+        )
+        for friction in (2.0, 0.05)
+    )
+    assert drags.kind is slips.kind is OutcomeKind.OK
+    assert drags.success
+    assert not slips.success
+    assert slips.motion < 0.2 * drags.motion
+
+
 def test_a_pull_that_pinches_nothing_is_no_grasp() -> None:
     slippery = HiddenDynamics(part_mass=0.2, joint_friction=0.05, surface_friction=0.1)
     outcome = act(door(), (-0.32, 0.0, 0.0), Primitive.PULL, slippery)
@@ -165,6 +236,19 @@ def test_a_settled_scene_stays_settled() -> None:
     for _ in range(480):
         scene.system.step()
     assert scene.joint_positions() == pytest.approx(before, abs=1e-5)
+
+
+def test_what_has_settled_stays_settled_whatever_it_is(tmp_path: Path) -> None:
+    folders = generate(tmp_path, dict.fromkeys(("Faucet", "Microwave", "Switch", "Table", "TrashCan", "Window"), 1), 4)
+    rng = np.random.default_rng(0)
+    for target in map(read_object, folders):
+        scene, limits = Scene(target, EASY, FAST), target.limits()
+        scene.put(rng.uniform(limits[:, 0], limits[:, 1]))
+        assert scene.settle(60, 960), target.ref.id
+        before = scene.joint_positions()
+        for _ in range(480):
+            scene.system.step()
+        assert scene.joint_positions() == pytest.approx(before, abs=1e-4), target.ref.id
 
 
 def test_gravity_pulls_and_a_part_that_falls_is_not_settled() -> None:
