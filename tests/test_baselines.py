@@ -1,5 +1,6 @@
 """The learnt baselines: trained like every other network, and judged with all methods in one table."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from learner.configuration import AdaptationConfig, InteractionConfig, LearnerConfig
+from learner.configuration import AdaptationConfig, InteractionConfig, LearnerConfig, TrainingConfig
 from learner.critics import OracleScores, row_critic
 from learner.data import Dataset, load_dataset
 from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD, evaluate, evaluate_store
@@ -17,6 +18,7 @@ from learner.oracle import OracleCritic, read_oracle
 from learner.prior import PriorStage
 from learner.recipes import ORACLE_FILE
 from learner.stages import StageJob, read_policy_folder, run_stage
+from learner.training import train
 from learner.where2act_adaptation import AdaptationStage
 from learner.where2act_interaction import InteractionStage
 from shared.adaptation import Adapter
@@ -29,7 +31,7 @@ from shared.policy import Policy
 from shared.records import InteractionRecord, RolloutRecord
 from shared.vocabulary import Interaction, Role
 from tests.test_learner_data import fabricated_plan, fabricated_rollouts, make_store
-from tests.test_learner_training import EVERYTHING, FAST, QUICK, descend
+from tests.test_learner_training import EVERYTHING, FAST, QUICK, Killed, KilledError, descend
 from tests.test_methods import BASELINES, CRITICS, policy_with_all
 from tests.test_networks import TINY
 
@@ -120,6 +122,23 @@ def test_gradients_reach_the_baseline_and_nothing_else(dataset: Dataset, name: B
 
 def stage_module(policy: Policy, name: str) -> list[tuple[str, nn.Parameter]]:
     return [(key, p) for key, p in policy.modules().named_parameters() if key.startswith(name)]
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_killed_baseline_ends_with_the_bits_of_one_that_was_not(
+    dataset: Dataset, tmp_path: Path, name: BaselineName
+) -> None:
+    config = TrainingConfig(steps=5, validate_every=2, checkpoint_seconds=0.0)
+    weights = []
+    for run, deaths in (("whole", []), ("killed", [3])):
+        (tmp_path / run).mkdir()
+        policy = Policy.untrained("push", TINY, 0)
+        for after in [*deaths, 10**6]:
+            stage = stage_of(name, dataset, policy)
+            with contextlib.suppress(KilledError):
+                train(Killed(stage, after), config, 3, tmp_path / run)
+        weights.append(policy.modules()[name].state_dict())
+    assert all(torch.equal(tensor, weights[1][key]) for key, tensor in weights[0].items())
 
 
 def test_the_tries_of_interaction_are_spread_and_no_questions(dataset: Dataset) -> None:
