@@ -30,7 +30,7 @@ GRACE_S = 5.0
 """What an actor's own watchdog, which leaves a traceback, has in advance of the driver, which cannot."""
 LOST = "its process was lost without a word: killed from outside, or for want of memory"
 POLL_S = 1.0
-"""How often the driver looks for hung actors when no receipt comes."""
+"""How often the driver looks for hung actors, however many receipts come."""
 
 logger = logging.getLogger(__name__)
 
@@ -89,6 +89,8 @@ class RayFleet:
         self._make_worker = make_worker
         self._underway = underway
         self._limits = limits
+        self._poll_s = min(POLL_S, limits.rollout_s / 4)
+        self._looked = time.monotonic()
         self._seats = [_Seat() for _ in range(workers)]
         self._policies: dict[int, Any] = {}
 
@@ -106,7 +108,7 @@ class RayFleet:
                 self._hand_out(plan, waiting, blame)
                 # A seat whose actor is still on its way has nothing else that could be ready.
                 refs = [seat.arrival or seat.pending[0][0] for seat in self._seats if seat.pending]
-                ready, _ = ray.wait(refs, num_returns=1, timeout=min(POLL_S, self._limits.rollout_s / 4))
+                ready, _ = ray.wait(refs, num_returns=1, timeout=self._poll_s)
                 if ready:
                     self._take_in(ready[0], waiting, blame, on_receipt)
                 self._replace_hung(waiting, blame)
@@ -170,6 +172,9 @@ class RayFleet:
         A rollout is over its limit when the driver has seen its breadcrumb unchanged for so long by its own clock:
         clocks of machines differ.
         """
+        if time.monotonic() - self._looked < self._poll_s:
+            return
+        self._looked = time.monotonic()
         for seat in self._seats:
             if not seat.pending:
                 continue

@@ -18,14 +18,16 @@ from cluster.collection import Collected, collect
 from cluster.fleet import SerialFleet
 from cluster.session import fleets
 from collector.guard import Limits
+from learner.data import load_dataset
 from shared.errors import StoreError
 from shared.files import process_name
 from shared.plan import Job, Plan
 from shared.records import RolloutStatus
-from shared.store import Store, verify
+from shared.store import Quarantined, Store, verify
 from shared.underway import Crumb, Underway, summary_of
 from tests.fabricate import fabricate_rollout, fabricate_setting
 from tests.misbehaving_worker import MisbehavingWorker
+from tests.test_networks import TINY
 
 OBJECTS = Path("objects")
 ROLLOUTS, PER_SHARD = 12, 4
@@ -65,6 +67,7 @@ def test_a_rollout_that_always_raises_is_given_up_and_nothing_else(tmp_path: Pat
     collected = fill(disturbed, {5: "raise", 6: "raise"})
     fill(undisturbed, {})
     assert collected.tally.quarantined == 2
+    assert len(load_dataset(disturbed, TINY).rollouts) == ROLLOUTS - 2
     assert collected.tally.rollouts == ROLLOUTS
     assert_only_these_are_missing(disturbed, undisturbed, {5, 6})
 
@@ -109,6 +112,14 @@ def test_a_quarantined_rollout_can_hold_no_label(tmp_path: Path) -> None:
     record = replace(fabricate_rollout(plan, 0), status=RolloutStatus.QUARANTINED)
     with pytest.raises(StoreError, match="is 'quarantined', so it cannot hold"):
         store.commit(plan, Job(plan.key, 0, 1), [record], {})
+
+
+def test_no_reason_is_given_for_what_was_executed(tmp_path: Path) -> None:
+    store = new_store(tmp_path)
+    plan = Plan(setting=store.setting)
+    given_up = Quarantined(rollout=0, reason="a crash", command="adaafford store replay")
+    with pytest.raises(StoreError, match="rollout 0 was executed"):
+        store.commit(plan, Job(plan.key, 0, 1), [fabricate_rollout(plan, 0)], {}, [given_up])
 
 
 def test_three_faults_or_ten_losses_quarantine_a_rollout() -> None:

@@ -67,7 +67,7 @@ class Quarantined(StrictModel):
     rollout: int = Field(ge=0)
     reason: str = Field(max_length=MAX_REASON)
     """One line."""
-    command: str = Field(max_length=4096)
+    command: str = Field(max_length=1 << 14)
     """What executes it alone, in the foreground."""
 
 

@@ -26,7 +26,7 @@ from shared.store.layout import (
 from shared.store.observations import ObservationArrays
 from shared.store.place import Folder, Place
 from shared.store.tables import INTERACTION_SCHEMA, MAX_ROW_BYTES, ROLLOUT_SCHEMA, column_values, read_table
-from shared.store.validity import check_rollouts
+from shared.store.validity import check_quarantined, check_rollouts
 from shared.vocabulary import (
     Action,
     Direction,
@@ -183,6 +183,7 @@ def read_rollouts(shard: Folder, manifest: ShardManifest) -> tuple[RolloutRecord
         raise StoreError(f"{shard}: a row is not a record ({line}); the file is foreign") from None
     job = Job(manifest.plan_key, manifest.start, manifest.stop)
     check_rollouts(rollouts, job, manifest.points, str(shard))
+    check_quarantined(rollouts, manifest.quarantined, str(shard))
     return tuple(rollouts)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from shared.errors import StoreError
 from shared.plan import Job
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
-from shared.store.layout import MAX_ALL_POINTS, MAX_ROWS
+from shared.store.layout import MAX_ALL_POINTS, MAX_ROWS, Quarantined
 from shared.store.observations import check_observation
 from shared.vocabulary import Float
 
@@ -44,6 +44,18 @@ def check_rollouts(rollouts: Sequence[RolloutRecord], job: Job, points: int, sou
             _check_rollout(rollout, points)
         except (ValueError, TypeError, AttributeError) as error:
             raise StoreError(f"{source}: rollout {rollout.index}: {error}") from None
+
+
+def check_quarantined(rollouts: Sequence[RolloutRecord], quarantined: Sequence[Quarantined], source: str) -> None:
+    """Hold what a manifest says was given up to the rollouts themselves.
+
+    Raises:
+        StoreError: a reason is given for a rollout that was executed.
+    """
+    given_up = {rollout.index for rollout in rollouts if rollout.status is RolloutStatus.QUARANTINED}
+    for each in quarantined:
+        if each.rollout not in given_up:
+            raise StoreError(f"{source}: rollout {each.rollout} was executed, so no reason can be given why it was not")
 
 
 def _check_rollout(rollout: RolloutRecord, points: int) -> None:

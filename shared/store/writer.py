@@ -30,7 +30,7 @@ from shared.store.reader import (
 )
 from shared.store.sealed import seal
 from shared.store.tables import table_bytes
-from shared.store.validity import check_rollouts
+from shared.store.validity import check_quarantined, check_rollouts
 
 
 def commit_shard(
@@ -60,6 +60,7 @@ def commit_shard(
     if is_committed(shard):
         return read_manifest(shard)
     check_rollouts(rollouts, job, points, job.shard_id)
+    check_quarantined(rollouts, quarantined, job.shard_id)
     files = _encode(rollouts, points)
 
     def describe(held: Mapping[str, bytes]) -> bytes:
