@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -37,6 +37,22 @@ def progress(title: str, total: int) -> Iterator[Advance]:
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=total)
         yield lambda: bar.update(task, advance=1)
+
+
+@contextmanager
+def advancing(title: str) -> Iterator[Callable[[int, int], None]]:
+    """The same for work that says itself how much is done, and how much there is, each time."""
+    with ExitStack() as stack:
+        shown: dict[int, Advance] = {}
+
+        def show(done: int, total: int) -> None:
+            if done == 1 or total not in shown:
+                stack.pop_all().close()
+                shown.clear()
+                shown[total] = stack.enter_context(progress(title, total))
+            shown[total]()
+
+        yield show
 
 
 class _Lines:

@@ -15,11 +15,15 @@ from cluster.settings import parse_flags
 from shared.errors import UsageError
 
 if TYPE_CHECKING:
+    from cluster.resimulation import Divergence
     from shared.records import RolloutRecord
+    from shared.store import Store
 
-ACTIONS = ("info", "verify", "digest", "replay")
+ACTIONS = ("info", "verify", "digest", "replay", "repair", "compact", "merge", "export")
 MOST_QUARANTINED = 20
 """Quarantined rollouts that `info` lists as text; `--json` lists all."""
+MOST_SHOWN = 20
+"""Rows with other labels that `verify --resimulate` prints; `--json` lists all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +42,12 @@ class VerifyCommand:
 
     store: Annotated[str, tyro.conf.Positional]
     """Folder or s3:// URL of the store."""
+    resimulate: int = 0
+    """Also execute this many random rows again, and say how far they come out otherwise; needs --objects."""
+    objects: Path | None = None
+    """Folder of the objects that the store was made with."""
+    seed: int = 1
+    """Of the choice of rows."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object instead of text."""
 
@@ -74,6 +84,10 @@ def main(args: list[str]) -> int:
             return _info(parse_flags(InfoCommand, args[1:], "store info"))
         case ["verify"]:
             return _verify(parse_flags(VerifyCommand, args[1:], "store verify"))
+        case ["repair" | "compact" | "merge" | "export"]:
+            from cluster.commands import upkeep
+
+            return upkeep.main(args)
         case ["digest"]:
             return _digest(parse_flags(DigestCommand, args[1:], "store digest"))
         case ["replay"]:
@@ -124,18 +138,63 @@ def _info(command: InfoCommand) -> int:
 
 
 def _verify(command: VerifyCommand) -> int:
+    from cluster.benchmarks.progress import advancing
     from shared.store import Store, verify
 
+    if command.resimulate < 0 or (command.resimulate > 0) != (command.objects is not None):
+        raise UsageError("--resimulate N (1 or more) needs --objects FOLDER, and the other way round")
     store = Store.open(command.store)
-    problems = verify(store)
-    shards = len(store.committed()) if not problems else None
+    with advancing("verifying, shards") as advance:
+        problems = verify(store, advance)
+    said: dict[str, Any] = {"ok": not problems, "problems": [asdict(problem) for problem in problems]}
+    divergence = None
+    if command.objects is not None and not problems:
+        divergence = _resimulated(store, command.objects, command)
+        said["resimulated"] = _as_json(divergence)
     if command.json:
-        print(json.dumps({"ok": not problems, "problems": [asdict(problem) for problem in problems]}, indent=2))
-    else:
-        for problem in problems:
-            print(f"{problem.where}: {problem.what}")
-        print(f"{len(problems)} problems" if problems else f"no problems in {shards} shards")
+        print(json.dumps(_finite(said), indent=2))
+        return 1 if problems else 0
+    for problem in problems:
+        print(f"{problem.where}: {problem.what}")
+    print(f"{len(problems)} problems" if problems else f"no problems in {len(store.committed())} shards")
+    if divergence is not None:
+        _print_divergence(divergence)
     return 1 if problems else 0
+
+
+def _resimulated(store: "Store", objects: Path, command: VerifyCommand) -> "Divergence":
+    from cluster.benchmarks.progress import progress
+    from cluster.resimulation import resimulate
+
+    with progress("executing rows again", command.resimulate) as advance:
+        return resimulate(store, objects, command.resimulate, command.seed, advance)
+
+
+def _as_json(divergence: "Divergence") -> dict[str, Any]:
+    import numpy as np
+
+    errors = divergence.joint_errors
+    return {
+        "rows": len(divergence.rows),
+        "other_labels": [
+            {"shard": row.shard, "rollout": row.rollout, "step": row.step, "stored": row.stored.success}
+            for row in divergence.other_labels
+        ],
+        "other_kinds": divergence.other_kinds,
+        "joint_error_median": float(np.median(errors)) if len(errors) else None,
+        "joint_error_max": float(errors.max()) if len(errors) else None,
+    }
+
+
+def _print_divergence(divergence: "Divergence") -> None:
+    said = _as_json(divergence)
+    print(f"{said['rows']} rows executed again")
+    print(f"  other labels   {len(said['other_labels'])}")
+    print(f"  other kinds    {said['other_kinds']}")
+    if said["joint_error_max"] is not None:
+        print(f"  joint error    {said['joint_error_median']:.2g} median, {said['joint_error_max']:.2g} at most")
+    for row in divergence.other_labels[:MOST_SHOWN]:
+        print(f"  {row.shard}, rollout {row.rollout}, step {row.step}: stored {row.stored.kind}, now {row.again.kind}")
 
 
 def _digest(command: DigestCommand) -> int:

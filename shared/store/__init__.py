@@ -3,6 +3,7 @@
 from shared.store.info import StoreInfo, Tally, info
 from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
 from shared.store.observations import ObservationArrays
+from shared.store.repair import Repair, repair
 from shared.store.store import Store
 from shared.store.verify import Problem, verify
 
@@ -12,10 +13,12 @@ __all__ = [
     "ObservationArrays",
     "Problem",
     "Quarantined",
+    "Repair",
     "ShardManifest",
     "Store",
     "StoreInfo",
     "Tally",
     "info",
+    "repair",
     "verify",
 ]

@@ -41,6 +41,8 @@ class Problem:
     """Path within the store."""
     what: str
     """One line."""
+    broken: str = ""
+    """Key of the file or folder that `store repair` sets aside; "" for what is missing."""
 
 
 def verify(store: Store, progress: Callable[[int, int], None] | None = None) -> list[Problem]:
@@ -74,7 +76,7 @@ def _shard(store: Store, shard: Folder, manifest: ShardManifest) -> Iterator[Pro
             reader.read_file(shard, manifest, name)
         except StoreError as error:
             damaged = True
-            yield _problem(f"{shard.key}/{name}", str(error), store)
+            yield _problem(f"{shard.key}/{name}", str(error), store, broken=shard.key)
     if damaged:
         return
     rollouts = reader.read_rollouts(shard, manifest)
@@ -124,10 +126,12 @@ def _plans_and_policies(store: Store, shards: Sequence[Folder]) -> Iterator[Prob
                 if name not in (*files, INDEX_FILE):
                     yield _problem(f"{folder}/{name}", "no file of this policy; remove it")
         except StoreError as error:
-            yield _problem(folder, str(error), store)
+            there = folder_name(version) in store.place.names(POLICIES_FOLDER)
+            if there or not store.place.exists(lost_policy_key(version)):
+                yield _problem(folder, str(error), store, broken=folder if there else "")
     for key in sorted({shard.name.rsplit("-", 2)[0] for shard in shards}):
         if key not in known:
-            yield _problem(f"{PLANS_FOLDER}/{key}.json", "shards of this plan exist, but no sound plan")
+            yield _problem(f"{PLANS_FOLDER}/{key}.json", "shards of this plan exist, but no sound plan", broken="")
 
 
 def _strangers(store: Store, shards: Sequence[Folder]) -> Iterator[Problem]:
@@ -174,6 +178,12 @@ def _overlaps(manifests: Sequence[ShardManifest]) -> Iterator[Problem]:
             yield _problem(where, f"holds rollouts that {before.shard_id} holds too; run `adaafford store repair`")
 
 
-def _problem(where: str, what: str, store: Store | None = None) -> Problem:
-    """A problem; what an error says of its own place is not said twice."""
-    return Problem(where, what if store is None else what.removeprefix(f"{store.where}/{where}: "))
+def _problem(where: str, what: str, store: Store | None = None, broken: str | None = None) -> Problem:
+    """A problem with what lies at `where`; what an error says of its own place is not said twice."""
+    line = what if store is None else what.removeprefix(f"{store.where}/{where}: ")
+    return Problem(where, line, where if broken is None else broken)
+
+
+def lost_policy_key(version: int) -> str:
+    """Where a repair notes that a policy is gone, which then is no problem any more."""
+    return f"{ASIDE_FOLDER}/lost-policies/{folder_name(version)}.json"

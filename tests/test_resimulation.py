@@ -1,0 +1,77 @@
+"""Rows that are executed again come out as they were stored, and one that lies is found."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cluster.cli import run
+from cluster.resimulation import first_positions, resimulate
+from collector.catalogue import scan
+from collector.procedural import generate
+from collector.scene import restricted_limits
+from collector.worker import Worker
+from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
+from shared.plan import Job, Plan, Setting
+from shared.store import Store
+from shared.vocabulary import Direction
+
+CONFIG = CollectionConfig(
+    camera=CameraConfig(image_size=128, points=256, candidates=1000),
+    rollout=RolloutConfig(interactions=6, actions_per_state=3),
+)
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("objects")
+    generate(folder, {"Faucet": 2}, seed=8)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def collected(objects: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Faucets, whose hidden direction restricts the joints."""
+    refs = tuple(entry.ref for entry in scan(objects).usable)
+    setting = Setting(task="push-faucet", seed=3, objects=refs, collection=CONFIG)
+    store, plan = Store.create(tmp_path_factory.mktemp("collected") / "store", setting), Plan(setting=setting)
+    Worker(store.where, objects).run(plan, Job(plan.key, 0, 2))
+    return store
+
+
+def test_rows_come_out_as_they_were_stored(collected: Store, objects: Path) -> None:
+    found = resimulate(collected, objects, 8, seed=1)
+    assert len(found.rows) == 8
+    assert found.other_labels == ()
+    assert found.other_kinds == 0
+    assert found.joint_errors.max() < 5e-3
+    chosen = [(row.shard, row.rollout, row.step) for row in found.rows]
+    assert len(set(chosen)) == 8
+    assert chosen != [(row.shard, row.rollout, row.step) for row in resimulate(collected, objects, 8, seed=2).rows]
+
+
+def test_a_label_that_lies_is_found(
+    collected: Store, objects: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    manifest = collected.committed()[0]
+    rollouts = [
+        dataclasses.replace(
+            rollout,
+            interactions=tuple(
+                dataclasses.replace(row, outcome=dataclasses.replace(row.outcome, success=not row.outcome.success))
+                for row in rollout.interactions
+            ),
+        )
+        for rollout in collected.read_rollouts(manifest.shard_id)
+    ]
+    store = Store.create(tmp_path / "store", collected.setting)
+    store.commit(collected.plans()[0], Job(manifest.plan_key, manifest.start, manifest.stop), rollouts, {})
+    assert run(["store", "verify", str(store.path), "--resimulate", "3", "--objects", str(objects)]) == 0
+    assert "other labels   3" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("direction", [Direction.CLOCKWISE, Direction.COUNTER_CLOCKWISE, Direction.BOTH])
+def test_limits_tell_where_the_joints_stood(direction: Direction) -> None:
+    limits, positions = np.array([[0.0, 1.5], [-1.0, 2.0]]), np.array([0.3, 0.7])
+    assert np.allclose(first_positions(restricted_limits(limits, positions, direction), direction), positions)
