@@ -146,10 +146,8 @@ class _Loop:
         losses = _Losses(stage)
         self._forward: nn.Module = losses
         if sharing.processes() > 1:
-            # What a stage leaves as it is gets no gradient, which would be waited for.
-            learning = sum(len(group.parameters) for group in self.groups)
-            some_rest = learning < sum(parameter.requires_grad for parameter in losses.parameters())
-            self._forward = DistributedDataParallel(losses, find_unused_parameters=some_rest)
+            # A gradient that never comes, of what a stage leaves as it is, would otherwise be waited for.
+            self._forward = DistributedDataParallel(losses, find_unused_parameters=True)
         self._viewer = EventFiles(out / EVENTS_FOLDER, self.cursor.step) if sharing.rank() == 0 else None
         self._saved_at = time.monotonic()
 

@@ -283,7 +283,9 @@ def test_sigkill_at_any_moment_changes_no_bit(store: Path, config_file: Path, tm
         return ["prior", "--store", str(store), "--out", str(out), "--config", str(config_file)]
 
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    assert train_process(arguments(whole)).wait(120) == 0
+    undisturbed = train_process(arguments(whole))
+    undisturbed.communicate(timeout=120)
+    assert undisturbed.returncode == 0
     rng, kills = random.Random(5), 0
     while True:
         child = train_process(arguments(killed))
