@@ -51,6 +51,10 @@ class Gripper(Protocol):
         """Put the hand at `displacement`, [3], from where it was placed, hand frame, moving at `velocity`, [3]."""
         ...
 
+    def displacement(self) -> Float:
+        """Where the hand is, [3], from where it was placed, hand frame."""
+        ...
+
     def drive(self, displacement: Float) -> None:
         """Drive the hand to `displacement`, [3], from where it was placed, hand frame."""
         ...
@@ -145,6 +149,10 @@ class FreeGripper:
         self._articulation.set_root_linear_velocity(self._rotation @ velocity)
         self._articulation.set_root_angular_velocity(np.zeros(3))
         self._articulation.set_qvel(np.zeros(2, dtype=np.float32))
+
+    def displacement(self) -> Float:
+        """See `Gripper.displacement`."""
+        return np.asarray((self._articulation.get_root_pose().p - self._origin) @ self._rotation, dtype=np.float64)
 
     def drive(self, displacement: Float) -> None:
         """See `Gripper.drive`."""

@@ -49,6 +49,10 @@ class JointedGripper:
         self.articulation.set_qpos(positions)
         self.articulation.set_qvel(velocities)
 
+    def displacement(self) -> Float:
+        """See `Gripper.displacement`."""
+        return np.asarray(self.articulation.get_qpos()[:3], dtype=np.float64)
+
     def drive(self, displacement: Float) -> None:
         """See `Gripper.drive`."""
         for joint, target in zip(self.joints, displacement, strict=False):

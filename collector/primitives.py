@@ -26,8 +26,10 @@ MOTION_SHARE = 0.5
 """Or this share of the joint's range, for joints whose range is small."""
 DIRECTION_COSINE = 0.5
 """The touched point must move within 60 deg of where the primitive means to take it."""
-CLEARANCE = 1e-3
+CLEARANCE = 3e-4
 """Free flight ends this far before the object."""
+LEAST_SKIP = 4
+"""Steps of free flight; to skip fewer would cost more than to simulate them."""
 REST_STEPS, REST_MOTION = 8, 3e-6
 """A hold may end when hand and object moved by less than the second a step over the first; at the time constant of the
 hand's drives (0.4 s) less than 0.3 mm is then left to come."""
@@ -94,6 +96,8 @@ class Trial:
         self.steps = 0
         self._checked = False
         self._brushed = False
+        self._clearance = 0.0
+        self._positions = np.full(1, np.nan)
         self._hand_at = np.zeros(3)
         self._opening = float("nan")
 
@@ -131,59 +135,78 @@ class Trial:
         )
 
     def _execute(self) -> None:
-        path, gripper, fidelity = trajectory(self.primitive), self.scene.gripper, self.fidelity
-        self._leg(path.approach, self._free_flight(path.approach) if fidelity.skip_free_flight else 0)
-        self._hold()
+        path, gripper = trajectory(self.primitive), self.scene.gripper
+        self._leg(path.approach)
+        self._hold(last=path.then is None)
         if self.primitive.pulls:
             gripper.drive_fingers(0.0)
-            self._hold()
+            self._hold(closing=True)
             self._opening = gripper.opening()
             if self._opening <= GRASP_OPENING:
                 raise _TrialEndedError(OutcomeKind.NO_GRASP)
         if path.then is not None:
             self._leg(path.then)
-            self._hold()
+            self._hold(last=True)
 
-    def _leg(self, end: Float, first: int = 0) -> None:
-        """Drive the hand along a straight line to `end`, [3], hand frame, at constant speed, from step `first` on."""
-        gripper, start, steps = self.scene.gripper, self._hand_at, self.fidelity.leg_steps
-        velocity = (end - start) * (self.fidelity.steps_per_second / steps)
-        if first:
-            gripper.shift(start + (end - start) * (first / steps), velocity)
+    def _leg(self, end: Float) -> None:
+        """Drive the hand along a straight line to `end`, [3], hand frame, at constant speed."""
+        gripper, steps = self.scene.gripper, self.fidelity.leg_steps
+        path = np.linspace(self._hand_at, end, steps + 1)
+        velocity = (end - self._hand_at) * (self.fidelity.steps_per_second / steps)
         gripper.drive_velocity(velocity)
-        for step in range(first + 1, steps + 1):
-            gripper.drive(start + (end - start) * (step / steps))
+        step = 0
+        while step < steps:
+            step += 1
+            gripper.drive(path[step])
             self._step()
+            if self.fidelity.skip_free_flight and (skipped := self._free_flight(path, step)):
+                step += skipped
+                gripper.shift(path[step], velocity)
         gripper.drive_velocity(np.zeros(3))
         self._hand_at = end
 
-    def _free_flight(self, end: Float) -> int:
-        """How many steps of the leg to `end`, [3], pass before the hand comes near the object.
+    def _free_flight(self, path: Float, step: int) -> int:
+        """How many steps after `step` of the leg along `path`, [steps + 1, 3], will touch and move nothing.
 
-        Nothing happens in these, so they need not be simulated. The hand is put ever further along its way, each time
-        by no more than its clearance, so that it cannot pass through anything.
+        These need not be simulated. The hand is put ahead by no more than its clearance, so that it cannot pass through
+        anything, and only while the object rests: before the first contact, or once the hand has let go of it.
         """
-        steps, length = self.fidelity.leg_steps, float(np.linalg.norm(end))
-        done = 0
-        while done < steps:
-            self.scene.gripper.shift(end * (done / steps), np.zeros(3))
-            self._step()
-            ahead = (self.scene.contact().clearance - CLEARANCE) / length * steps
-            if ahead < 1:
-                break
-            done = min(done + int(ahead), steps)
-        return done
+        if self._checked:
+            if step % REST_STEPS or not self._object_rests():
+                return 0
+            self._clearance = self.scene.contact().clearance
+        if self._clearance <= CLEARANCE:
+            return 0
+        stride = float(np.linalg.norm(path[1] - path[0]))
+        lag = float(np.linalg.norm(path[step] - self.scene.gripper.displacement()))
+        ahead = min(int((self._clearance - CLEARANCE - lag) / stride), len(path) - 1 - step)
+        return ahead if ahead >= LEAST_SKIP else 0
 
-    def _hold(self) -> None:
-        """Keep all drive targets for a while."""
+    def _object_rests(self) -> bool:
+        """Whether no joint has moved since this was asked last, `REST_STEPS` ago or more."""
+        before, self._positions = self._positions, self.scene.joint_positions()
+        return bool(np.abs(self._positions - before).max() < REST_STEPS * REST_MOTION)
+
+    def _hold(self, closing: bool = False, last: bool = False) -> None:
+        """Keep all drive targets for a while.
+
+        Args:
+            closing: the fingers close; once they are so near each other that they hold nothing, all is said.
+            last: nothing comes after this hold, so that a hand which has let go of a resting object may move on.
+        """
         before = np.zeros(0)
         for step in range(self.fidelity.hold_steps):
             self._step()
-            if self.fidelity.end_holds_at_rest and step % REST_STEPS == 0:
-                now = self.scene.coordinates()
-                if step and np.abs(now - before).max() < REST_STEPS * REST_MOTION:
-                    return
-                before = now
+            if not self.fidelity.end_holds_at_rest or step % REST_STEPS:
+                continue
+            now = self.scene.coordinates()
+            if closing and self.scene.gripper.opening() <= GRASP_OPENING:
+                return
+            if step and np.abs(now - before).max() < REST_STEPS * REST_MOTION:
+                return
+            if last and self._object_rests() and self.scene.contact().clearance > CLEARANCE:
+                return
+            before = now
 
     def _step(self) -> None:
         self.scene.system.step()
@@ -198,6 +221,7 @@ class Trial:
         """
         contact = self.scene.contact()
         self._brushed = self._brushed or contact.brushes
+        self._clearance = contact.clearance
         if contact.presses:
             if self.steps == 1:
                 raise _TrialEndedError(OutcomeKind.START_COLLISION)

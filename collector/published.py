@@ -69,13 +69,13 @@ class PublishedTiming(StrictModel):
 class PublishedTrial(Trial):
     """A trial whose every step is controlled from Python, as the authors' robot is."""
 
-    def _leg(self, end: Float, first: int = 0) -> None:
+    def _leg(self, end: Float) -> None:
         """Drive the hand to `end`, [3], hand frame, by velocities of its joints that are computed at every step."""
         gripper, steps, rate = _jointed(self.scene), self.fidelity.leg_steps, self.fidelity.steps_per_second
         hand, arm = gripper.articulation, gripper.joints[:6]
         palm, model = hand.links.index(gripper.palm), hand.create_pinocchio_model()
         targets, twist = np.append(self._hand_at, np.zeros(3)), np.zeros(6)
-        for step in range(first, steps):
+        for step in range(steps):
             positions = hand.get_qpos()
             if step % TWIST_EVERY_STEPS == 0:
                 twist[:3] = (end - positions[:3]) * (rate / (steps - step))
@@ -89,7 +89,7 @@ class PublishedTrial(Trial):
             self._step()
         self._hand_at = end
 
-    def _hold(self) -> None:
+    def _hold(self, closing: bool = False, last: bool = False) -> None:
         """Keep all drive targets for a while."""
         gripper = _jointed(self.scene)
         hand = gripper.articulation

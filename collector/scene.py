@@ -23,6 +23,9 @@ CONTACT_FORCE = 5.0
 """N. The published rule counts contact points with a squared impulse above 1e-4; at its 1/500 s that is this force."""
 CONTACT_RANGE = 0.02
 """The engine lists pairs that are closer than this: the sum of two shapes' contact offsets."""
+TOUCHING = 1e-3
+"""Pairs further apart exert no force: until it touches something, the hand moves by a tenth of this a step. (Each force
+that is read costs as much as the rest of its pair.)"""
 FORGETTING_STEPS = 1
 """Steps with the hand out of reach, after which the engine holds no contact of the trial before."""
 PARKED = np.array([0.0, 0.0, 50.0])
@@ -155,9 +158,13 @@ class Scene:
             first, second = contact.bodies
             if (first in self._hand) == (second in self._hand):
                 continue
-            strongest = max((float(p.impulse @ p.impulse) for p in contact.points), default=0.0)
+            strongest = 0.0
+            for point in contact.points:
+                separation = point.separation
+                clearance = min(clearance, separation)
+                if separation < TOUCHING:
+                    strongest = max(strongest, float(point.impulse @ point.impulse))
             brushes = brushes or strongest > 0.0
-            clearance = min(clearance, *(p.separation for p in contact.points))
             if strongest <= self._impulse_squared:
                 continue
             hand, other = (first, second) if first in self._hand else (second, first)
