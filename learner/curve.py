@@ -14,8 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from learner.critics import OracleScores
 from learner.data import Dataset
-from learner.frozen import FrozenAap
+from learner.frozen import FrozenAap, FrozenPrior
 from learner.losses import action_scoring_losses
 from learner.metrics import Discrimination, correlation, discrimination
 from learner.oracle import OracleCritic
@@ -75,13 +76,14 @@ def adaptation_curve(
     labels = dataset.rows.success[ordered.rows][asked].numpy()
     found = []
     if prior is not None:
-        found.append(CurvePoint("prior", 0, discrimination(_prior_scores(dataset, ordered.rows[asked], prior), labels)))
+        scores = FrozenPrior.of(prior, dataset).scores[ordered.rows[asked]].numpy()
+        found.append(CurvePoint("prior", 0, discrimination(scores, labels)))
     logits = after_tries(dataset, frozen, ordered, list(tries))
     for place, number in enumerate(tries):
         scores = torch.sigmoid(logits[:, place][asked]).numpy()
         found.append(CurvePoint("aap", number, discrimination(scores, labels)))
     if oracle is not None:
-        scores = _oracle_scores(dataset, ordered.rows[asked], oracle)
+        scores = OracleScores(oracle, dataset)(ordered.rows[asked], torch.zeros(0, dtype=torch.long)).numpy()
         found.append(CurvePoint("oracle", 0, discrimination(scores, labels)))
     return found
 
@@ -175,18 +177,3 @@ def _gains_of(
     )
     scores = aip.action_scores(features[tried], data.xyz[tried], data.frame[tried], latent, believed)
     return (losses[0] - losses[1:]).numpy(), scores.numpy(), float(losses[0])
-
-
-@torch.no_grad()
-def _prior_scores(dataset: Dataset, index: Tensor, prior: Prior) -> NDArray[np.float32]:
-    rows = dataset.rows
-    features = frozen_features(prior.encoder, dataset.clouds, rows.cloud[index], rows.point[index])
-    return torch.sigmoid(prior.action_logits(features, rows.xyz[index], rows.frame[index])).numpy()
-
-
-@torch.no_grad()
-def _oracle_scores(dataset: Dataset, index: Tensor, oracle: OracleCritic) -> NDArray[np.float32]:
-    rows = dataset.rows
-    features = frozen_features(oracle.aap.encoder, dataset.clouds, rows.cloud[index], rows.point[index])
-    latents = oracle.oracle(rows.facts[index])
-    return torch.sigmoid(oracle.aap.action_logits(features, rows.xyz[index], rows.frame[index], latents)).numpy()
