@@ -3,7 +3,7 @@
 They share one loop and differ in one thing each (AdaAfford, Baselines and Ablation Study, and its supplement).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -13,6 +13,17 @@ BaselineName = Literal["where2act-interaction", "where2act-adaptation"]
 """Baselines with a network of their own, which are trained only where they are wanted."""
 CriticName = Literal["where2act", "aap", BaselineName]
 TriesName = Literal["random", "aip", "fps", "purefps", "argfps", "where2act-fps"]
+MethodName = Literal[
+    "where2act",
+    "where2act-interaction",
+    "where2act-adaptation",
+    "ours-random",
+    "ours-purefps",
+    "ours-argfps",
+    "ours-fps",
+    "ours-no-iteration",
+    "ours-final",
+]
 
 FIRST_VERSION = 1
 """The policy of the first round of the alternation."""
@@ -43,7 +54,7 @@ class Method:
         return evaluated if self.version is None else min(self.version, evaluated)
 
 
-METHODS = {
+METHODS: Mapping[MethodName, Method] = {
     "where2act": Method(None, "where2act"),
     "where2act-interaction": Method("where2act-fps", "where2act-interaction", in_one_shot=4),
     "where2act-adaptation": Method("where2act-fps", "where2act-adaptation"),
@@ -62,17 +73,18 @@ def method_named(name: str) -> Method:
     Raises:
         UsageError: there is no such method; the message lists those there are.
     """
-    if name not in METHODS:
-        raise UsageError(f"unknown method '{name}'; allowed: {', '.join(METHODS)}")
-    return METHODS[name]
+    for known, method in METHODS.items():
+        if name == known:
+            return method
+    raise UsageError(f"unknown method '{name}'; allowed: {', '.join(METHODS)}")
 
 
-def baselines_of(methods: Sequence[str]) -> list[BaselineName]:
+def baselines_of(methods: Sequence[MethodName]) -> list[BaselineName]:
     """The networks of their own that methods need, each once."""
     wanted = {METHODS[name].critic for name in methods}
     return [name for name in get_args(BaselineName) if name in wanted]
 
 
-def versions_of(methods: Sequence[str], evaluated: int) -> list[int]:
+def versions_of(methods: Sequence[MethodName], evaluated: int) -> list[int]:
     """The policy versions that methods use where version `evaluated` is evaluated, which is one of them."""
     return sorted({METHODS[name].policy_version(evaluated) for name in methods} | {evaluated})

@@ -7,11 +7,10 @@ range of a plan's rollouts and makes one *shard*. Nothing here knows who does th
 from dataclasses import dataclass
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from shared.configuration import CollectionConfig, StrictModel
-from shared.errors import UsageError
-from shared.methods import method_named
+from shared.methods import MethodName
 from shared.tasks import Terms, task_named
 
 
@@ -26,20 +25,10 @@ class ObjectRef(StrictModel):
 class EvaluationConfig(StrictModel):
     """What is tried on each test object."""
 
-    methods: tuple[str, ...] = ("where2act", "ours-random", "ours-final")
+    methods: tuple[MethodName, ...] = ("where2act", "ours-random", "ours-final")
     budgets: tuple[int, ...] = (1, 2, 4)
     queries: int = Field(24, ge=1)
     """Random test interactions a rollout, which critics are asked about (F-score)."""
-
-    @field_validator("methods")
-    @classmethod
-    def _known(cls, methods: tuple[str, ...]) -> tuple[str, ...]:
-        for name in methods:
-            try:
-                method_named(name)
-            except UsageError as error:
-                raise ValueError(str(error)) from None
-        return methods
 
 
 class Setting(StrictModel):

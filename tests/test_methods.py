@@ -3,17 +3,28 @@
 import dataclasses
 import hashlib
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from safetensors.torch import load, save
 
 from shared.adaptation import Adapter, frames_in_view, movable_points
 from shared.critics import Critic, critic_named
 from shared.errors import StoreError, UsageError
 from shared.fps import LEAST_POINTS, THRESHOLD, FpsProposer, actionable_points, distances_to
-from shared.methods import METHODS, BaselineName, CriticName, Method, baselines_of, method_named, versions_of
+from shared.methods import (
+    METHODS,
+    BaselineName,
+    CriticName,
+    Method,
+    MethodName,
+    baselines_of,
+    method_named,
+    versions_of,
+)
 from shared.networks.where2act_interaction import TRIES, Where2ActInteraction
 from shared.plan import EvaluationConfig
 from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
@@ -229,8 +240,9 @@ def test_methods_say_what_they_need() -> None:
 
 
 def test_a_misspelt_method_is_refused_when_the_evaluation_is_planned() -> None:
-    with pytest.raises(ValueError, match="unknown method 'ours-fsp'"):
-        EvaluationConfig(methods=("ours-fsp",))
+    assert get_args(MethodName) == tuple(METHODS)
+    with pytest.raises(ValidationError, match="ours-argfps"):
+        EvaluationConfig.model_validate({"methods": ["ours-fsp"]})
 
 
 # Policies
