@@ -37,11 +37,13 @@ format: $(STAMP)  ## Put the code in its form.
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: $(STAMP)  ## Fidelity, dynamics and speed of push and pull, into dated files; OBJECTS=FOLDER for real objects.
+bench: $(STAMP)  ## Fidelity, dynamics and speed of push and pull, and of learning, into dated files; OBJECTS=FOLDER for real objects.
 	@for task in push pull; do for what in "fidelity --trials 500" dynamics "collect --workers 2"; do \
 	  echo "== bench $$what, $$task"; \
 	  $(BIN)/adaafford bench $$what --task $$task $(if $(OBJECTS),--objects $(OBJECTS)) --out benchmarks || exit 1; \
 	done; done
+	$(BIN)/adaafford bench learner --out benchmarks
+	$(BIN)/adaafford bench adapt --out benchmarks
 
 clean:  ## Remove the environment, caches and runs/.
 	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

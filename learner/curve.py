@@ -73,17 +73,17 @@ def adaptation_curve(
     ordered = order_rows(dataset, [r for r in rollouts for _ in range(draws)], 1 << 16, np.random.default_rng(seed))
     asked = ordered.valid.clone()
     asked[:, :context] = False
-    labels = dataset.rows.success[ordered.rows][asked].numpy()
+    labels = dataset.rows.success[ordered.rows][asked].numpy(force=True)
     found = []
     if prior is not None:
-        scores = FrozenPrior.of(prior, dataset).scores[ordered.rows[asked]].numpy()
+        scores = FrozenPrior.of(prior, dataset).scores[ordered.rows[asked]].numpy(force=True)
         found.append(CurvePoint("prior", 0, discrimination(scores, labels)))
     logits = after_tries(dataset, frozen, ordered, list(tries))
     for place, number in enumerate(tries):
-        scores = torch.sigmoid(logits[:, place][asked]).numpy()
+        scores = torch.sigmoid(logits[:, place][asked]).numpy(force=True)
         found.append(CurvePoint("aap", number, discrimination(scores, labels)))
     if oracle is not None:
-        scores = OracleScores(oracle, dataset)(ordered.rows[asked], torch.zeros(0, dtype=torch.long)).numpy()
+        scores = OracleScores(oracle, dataset)(ordered.rows[asked], torch.zeros(0, dtype=torch.long)).numpy(force=True)
         found.append(CurvePoint("oracle", 0, discrimination(scores, labels)))
     return found
 
@@ -176,4 +176,4 @@ def _gains_of(
         frozen.aap.action_logits(frozen.features[tried], data.xyz[tried], data.frame[tried], latent)
     )
     scores = aip.action_scores(features[tried], data.xyz[tried], data.frame[tried], latent, believed)
-    return (losses[0] - losses[1:]).numpy(), scores.numpy(), float(losses[0])
+    return (losses[0] - losses[1:]).numpy(force=True), scores.numpy(force=True), float(losses[0])

@@ -21,7 +21,7 @@ from learner.losses import (
     proposal_loss,
     top_score,
 )
-from learner.metrics import area_under_roc, best_f_score, discrimination, f_score
+from learner.metrics import area_under_roc, best_f_score, calibration_error, discrimination, f_score
 from learner.sampling import Batch, order_rows
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
@@ -258,3 +258,19 @@ def test_the_proposal_loss_is_that_of_the_best_draw() -> None:
     draws = orthonormal_frames(torch.randn(2, 5, 6, generator=torch.Generator().manual_seed(0)))
     assert proposal_loss(draws, draws[:, 3]).item() == pytest.approx(0.0, abs=3e-3)
     assert proposal_loss(draws[:0], draws[:0, 0]).item() == 0.0
+
+
+@given(st.integers(1, 40), st.integers(0, 40), st.floats(0.0, 1.0))
+def test_a_constant_is_off_by_its_distance_from_the_base_rate(failures: int, successes: int, score: float) -> None:
+    labels = np.array([False] * failures + [True] * successes)
+    found = calibration_error(np.full(len(labels), score), labels)
+    assert found == pytest.approx(abs(score - labels.mean()))
+
+
+def test_scores_that_come_true_are_calibrated() -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.random(20_000)
+    labels = rng.random(20_000) < scores
+    assert calibration_error(scores, labels) < 0.02
+    assert calibration_error(1.0 - scores, labels) > 0.4
+    assert np.isnan(calibration_error(np.zeros(0), np.zeros(0, dtype=bool)))

@@ -221,12 +221,12 @@ def finish(command: BenchSettings, name: str, result: dict[str, Any]) -> int:
     from cluster.benchmarks.results import as_line, keep
 
     objects = "built-in" if command.objects is None else command.objects.name
-    result = {"task": command.task} | result | {"benchmark": name, "objects_from": objects, "seed": command.seed}
+    result = {"task": command.task, "objects_from": objects} | result | {"benchmark": name, "seed": command.seed}
     if command.primitive is not None:
         result["primitive"] = command.primitive.value
     if command.out is not None:
-        what = command.task if command.primitive is None else f"{command.task}-as-{command.primitive.value}"
-        print(f"kept in {keep(result, command.out, f'{name}-{what}-{objects}')}")
+        what = result["task"] if command.primitive is None else f"{command.task}-as-{command.primitive.value}"
+        print(f"kept in {keep(result, command.out, f'{name}-{what}-' + result['objects_from'])}")
     if command.as_json:
         print(as_line(result))
     return 0

@@ -74,7 +74,7 @@ def learner(args: list[str]) -> int:
         benchmark = LearningBenchmark(store, config, command.repeats, command.steps, command.port_interactions)
         with progress("turns of training, and of the published step", benchmark.turns) as advance:
             benchmark.run(advance)
-        result = benchmark.as_json() | {"task": store.setting.task}
+        result = benchmark.as_json() | _source(command, store)
     _print_learner(result)
     return finish(command, "learner", result)
 
@@ -91,7 +91,7 @@ def adapt(args: list[str]) -> int:
         benchmark = AdaptationBenchmark(store, policy, command.repeats)
         with progress("rollouts of test-time steps", benchmark.turns) as advance:
             benchmark.run(advance)
-        result = benchmark.as_json() | {"task": store.setting.task}
+        result = benchmark.as_json() | _source(command, store)
     print(f"{result['steps']} steps at each size, {result['threads']} threads; medians in ms")
     print(f"  {'points':>7}{'propose':>9}{'update':>9}{'step':>9}{'known observation':>20}")
     for size, figures in result["milliseconds"].items():
@@ -109,6 +109,12 @@ def _print_learner(result: dict[str, Any]) -> None:
         print(", ".join(f"{part} {1e3 * seconds:.1f}" for part, seconds in parts.items()))
     print(f"  port  {port:>9.2f} interactions/s at {result['port_points']:,} points each")
     print(f"AAP is {result['times_straightforward_port']:,.0f} times the straightforward port")
+
+
+def _source(command: StoredSettings, store: "Store") -> dict[str, str]:
+    """What the figures were measured on."""
+    named = {} if command.store is None else {"objects_from": f"store-{command.store.name}"}
+    return {"task": store.setting.task} | named
 
 
 @contextmanager
