@@ -3,6 +3,7 @@
 import ctypes
 import os
 import signal
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,4 +88,6 @@ class FakeWorker:
         left = int(path.read_text()) if path.exists() else 0
         if left:
             path.write_text(str(left - 1))
+            # A real worker takes seconds to begin; by then the actor's word that it is up has reached the driver.
+            time.sleep(0.2)
         return left > 0
