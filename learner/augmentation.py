@@ -29,7 +29,7 @@ def draw_turns(count: int, config: AugmentationConfig, rng: np.random.Generator)
 def turn_vectors(turns: Tensor, vectors: Tensor) -> Tensor:
     """Vectors or points, [B, n, 3 k], each three of them turned by the matrices [B, 3, 3]."""
     triples = vectors.reshape(*vectors.shape[:2], -1, 3)
-    return torch.einsum("bij,bnkj->bnki", turns, triples).reshape(vectors.shape)
+    return _turned(turns, triples).reshape(vectors.shape)
 
 
 def turn_facts(turns: Tensor, facts: Tensor) -> Tensor:
@@ -39,7 +39,12 @@ def turn_facts(turns: Tensor, facts: Tensor) -> Tensor:
     room, turning, sliding = ways[..., :1], ways[..., 1:4], ways[..., 4:]
     # An axis of rotation is the cross product of two vectors: a mirror turns it round beside reflecting it.
     handed = torch.linalg.det(turns)[:, None, None, None]
-    turning = handed * torch.einsum("bij,bnkj->bnki", turns, turning)
-    sliding = torch.einsum("bij,bnkj->bnki", turns, sliding)
+    turning = handed * _turned(turns, turning)
+    sliding = _turned(turns, sliding)
     turned = ordered_ways(torch.cat([room, turning, sliding], dim=-1))
     return torch.cat([dynamics, turned.flatten(-2)], dim=-1)
+
+
+def _turned(turns: Tensor, triples: Tensor) -> Tensor:
+    """Vectors [B, n, k, 3] turned; a sum of products, since a matrix product may be taken in half precision."""
+    return (turns[:, None, None] * triples[..., None, :]).sum(dim=-1)

@@ -22,6 +22,7 @@ from cluster.training import as_toml
 from learner.alternation import ALTERNATION_FILE, alternate, converged
 from learner.configuration import AlternationConfig, LearnerConfig
 from learner.data import load_dataset, split, without_later
+from learner.hardware import Hardware
 from learner.progress import ProgressReport, Standing
 from learner.stages import DONE_FILE, StageJob, run_stage
 from learner.training import CHECKPOINT_FILE, METRICS_FILE
@@ -266,6 +267,16 @@ def test_the_command_says_what_it_needs(capsys: pytest.CaptureFixture[str]) -> N
     with pytest.raises(SystemExit):
         run(["train", "aap", "--help"])
     assert "--aap.imitation" in capsys.readouterr().out
+
+
+def test_every_stage_learns_in_bf16(store: Path, tmp_path: Path) -> None:
+    before: Path | None = None
+    for stage in ("prior", "aap", "aip"):
+        job = StageJob(stage, store, tmp_path / stage, before)
+        run_stage(job, FAST, Hardware(bf16=True))
+        before = job.out
+    lines = [json.loads(line) for line in (tmp_path / "prior" / METRICS_FILE).read_text().splitlines()]
+    assert lines[-1]["score"] < lines[0]["score"]
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(store: Path, tmp_path: Path) -> None:

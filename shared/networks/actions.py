@@ -79,6 +79,8 @@ def orthonormal_frames(raw: Tensor) -> Tensor:
     Numbers that determine no rotation (a zero or a parallel pair) still give one, so that no weights can make an
     action that is not a rotation.
     """
+    # In half precision, a rotation would be off by a degree.
+    raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
     approach = _unit(raw[..., :3], raw.new_tensor([1.0, 0.0, 0.0]))
     # The axis that the approach has least of is never parallel to it.
     spare = functional.one_hot(approach.detach().abs().argmin(dim=-1), 3).to(raw.dtype)
