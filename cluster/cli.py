@@ -21,7 +21,7 @@ COMMANDS = {
     "report": "print a run's results again",
     "collect": "collect interactions into a store, without any learning",
     "train": "prior, aap, aip or alternate: train from a store alone",
-    "store": "info, verify, digest or replay: look into a store",
+    "store": "info, verify, digest, replay, repair, compact, merge or export: look after stores",
     "objects": "generate, check, preview or decompose: the objects",
     "bench": "fidelity, dynamics, collect, learner or adapt: measure how fast and how true each part is",
     "version": "print the version",

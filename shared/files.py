@@ -34,10 +34,22 @@ def write_durably(path: Path, data: bytes) -> None:
     Raises:
         OSError: the file exists already, or cannot be written.
     """
-    with path.open("xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    try:
+        _write_all(descriptor, data)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _write_all(descriptor: int, data: bytes) -> None:
+    left = memoryview(data)
+    while left:
+        # The system may take less than it is given, and says so by the count alone.
+        taken = os.write(descriptor, left)
+        if taken == 0:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        left = left[taken:]
 
 
 def sync_folder(path: Path) -> None:

@@ -11,8 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from shared.plan import Job, Plan
+from shared.records import RolloutRecord
 from shared.store import Store
 from tests.fabricate import fabricate_rollouts, fabricate_setting
+from tests.faults import Fault, bucket_faults
 
 POINTS = 64
 
@@ -59,6 +61,33 @@ def kill_commits(path: Path) -> int:
     raise AssertionError("the commit never ended")
 
 
+def kill_in_bucket(url: str, kind: str) -> int:
+    """Commit rollout n in a child that is killed at its n-th write, for every one there is; how many there were."""
+    setting = fabricate_setting(points=POINTS)
+    plan = Plan(setting=setting)
+
+    def in_child(work: Callable[[], object]) -> bool:
+        # The parent never opens the store: the client has threads, which a fork would lose.
+        child = os.fork()
+        if child == 0:
+            work()
+            os._exit(0)
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+    in_child(lambda: Store.create(url, setting).add_plan(plan))
+    for step in range(1, 1000):
+        job = Job(plan.key, step - 1, step)
+        rollouts = fabricate_rollouts(plan, job, interactions=2)
+
+        def work(job: Job = job, rollouts: list[RolloutRecord] = rollouts, step: int = step) -> None:
+            with bucket_faults(Fault(kind, step)):
+                Store.open(url).commit(plan, job, rollouts, {})
+
+        if not in_child(work):
+            return step
+    raise AssertionError("the commit never ended")
+
+
 def kill_creations(path: Path) -> int:
     """Create a store in a child that dies at its n-th step, then again; how many steps there were."""
     setting = fabricate_setting(points=POINTS)
@@ -90,5 +119,8 @@ def race(path: Path, writers: int) -> int:
 
 
 if __name__ == "__main__":
+    if sys.argv[1] == "kill-in-bucket":
+        print(kill_in_bucket(*sys.argv[2:]))
+        sys.exit()
     task, folder = sys.argv[1], Path(sys.argv[2])
     print({"kill-commits": kill_commits, "kill-creations": kill_creations, "race": lambda p: race(p, 4)}[task](folder))

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -23,11 +24,61 @@ class RepairCommand:
     """Print one JSON object instead of text."""
 
 
+@dataclass(frozen=True, slots=True)
+class CompactCommand:
+    """Make large shards of small ones; the small ones are set aside, the digest stays. Stop all collection first."""
+
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
+    rollouts: int = 256
+    """The most that one shard may hold."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True, slots=True)
+class MergeCommand:
+    """Put what several stores of the same setting hold into one; of a single store, copy it."""
+
+    stores: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Folders or s3:// URLs."""
+    out: str
+    """Folder or s3:// URL of the new store."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportCommand:
+    """Write a store as plain files, one Parquet and one Zarr group a split, with a data card."""
+
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
+    out: Path
+    """A new folder."""
+    test_share: float = 0.0
+    """Share of each category's objects that go into the split "test"; without it there is one split, "train"."""
+    seed: int = 1
+    """Of the draw of test objects."""
+    train_objects: Path | None = None
+    """Instead: a text file with the ids of the objects of the split "train", one a line."""
+    test_objects: Path | None = None
+    """The same for "test"."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
 def main(args: list[str]) -> int:
     """Dispatch; `args` begin with the action."""
     match args[0]:
         case "repair":
             return _repair(parse_flags(RepairCommand, args[1:], "store repair"))
+        case "compact":
+            return _compact(parse_flags(CompactCommand, args[1:], "store compact"))
+        case "merge":
+            return _merge(parse_flags(MergeCommand, args[1:], "store merge"))
+        case "export":
+            return _export(parse_flags(ExportCommand, args[1:], "store export"))
     raise UsageError(f"no action '{args[0]}'")
 
 
@@ -56,4 +107,59 @@ def _repair(command: RepairCommand) -> int:
     if len(commands) > MOST_SHOWN:
         print(f"  and {len(commands) - MOST_SHOWN} more; the same `adaafford collect` as before collects all of them")
     print(f"{len(done.problems)} problems repaired" if done.problems or done.made_anew else "nothing to repair")
+    return 0
+
+
+def _compact(command: CompactCommand) -> int:
+    from cluster.benchmarks.progress import advancing
+    from shared.store import Store, compact
+
+    store = Store.open(command.store)
+    with advancing("compacting, shards") as advance:
+        done = compact(store, command.rollouts, advance)
+    if command.json:
+        print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
+        return 0
+    print(f"{done.before} shards became {done.after}; {len(done.set_aside)} small ones lie in {store.where}/aside")
+    return 0
+
+
+def _merge(command: MergeCommand) -> int:
+    from cluster.benchmarks.progress import advancing
+    from shared.store import Store, merge
+
+    if not command.stores:
+        raise UsageError("store merge needs one store or more, and --out")
+    with advancing("merging, shards") as advance:
+        store, done = merge([Store.open(where) for where in command.stores], command.out, advance)
+    if command.json:
+        print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
+        return 0
+    print(f"{done.rollouts} rollouts in {done.shards} shards, {done.in_several} of them in several stores alike")
+    print(f"into {store.where}, digest {store.digest()}")
+    return 0
+
+
+def _export(command: ExportCommand) -> int:
+    from cluster.benchmarks.progress import advancing
+    from learner.data import read_object_list
+    from shared.store import Store, export
+    from shared.store.export import splits_by_share
+
+    store = Store.open(command.store)
+    lists = {"train": read_object_list(command.train_objects), "test": read_object_list(command.test_objects)}
+    splits = {name: objects for name, objects in lists.items() if objects is not None}
+    if splits and command.test_share:
+        raise UsageError("--test-share and lists of objects exclude each other; give one")
+    with advancing("exporting, shards") as advance:
+        done = export(store, command.out, splits or splits_by_share(store, command.test_share, command.seed), advance)
+    if command.json:
+        described = {
+            name: asdict(figures) | {"objects": sorted(figures.objects)} for name, figures in done.splits.items()
+        }
+        print(json.dumps({"out": done.out, "splits": described}, indent=2))
+        return 0
+    for name, figures in done.splits.items():
+        print(f"{name:<6} {figures.interactions} interactions of {len(figures.objects)} objects")
+    print(f"into {done.out}; its README.md says what they are")
     return 0

@@ -1,7 +1,10 @@
 """The store: immutable shards, each complete if and only if its manifest is there."""
 
+from shared.store.compaction import Compaction, compact
+from shared.store.export import Export, export
 from shared.store.info import StoreInfo, Tally, info
 from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
+from shared.store.merging import Merged, merge
 from shared.store.observations import ObservationArrays
 from shared.store.repair import Repair, repair
 from shared.store.store import Store
@@ -9,7 +12,10 @@ from shared.store.verify import Problem, verify
 
 __all__ = [
     "SCHEMA_VERSION",
+    "Compaction",
+    "Export",
     "FileEntry",
+    "Merged",
     "ObservationArrays",
     "Problem",
     "Quarantined",
@@ -18,7 +24,10 @@ __all__ = [
     "Store",
     "StoreInfo",
     "Tally",
+    "compact",
+    "export",
     "info",
+    "merge",
     "repair",
     "verify",
 ]

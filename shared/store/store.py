@@ -60,6 +60,7 @@ class Store:
         """Use `Store.create` or `Store.open`."""
         self.place = place
         self.document = document
+        self._recorded: dict[str, Plan] = {}
 
     @property
     def where(self) -> str:
@@ -124,15 +125,17 @@ class Store:
         Raises:
             StoreError: the plan is of another setting, or another plan has its name.
         """
+        if self._recorded.get(plan.key) == plan:
+            return
         if plan.setting != self.setting:
             difference = difference_of(self.setting.model_dump(mode="json"), plan.setting.model_dump(mode="json"))
             raise StoreError(f"{self.where}: plan {plan.key} is of another setting: {difference}")
         key = f"{PLANS_FOLDER}/{plan.key}.json"
-        if self.place.create(key, seal(plan.model_dump(mode="json"))):
-            return
+        made = self.place.create(key, seal(plan.model_dump(mode="json")))
         # Compared as plans: a setting that came with later software has its default in a file that lacks it.
-        if self.read_plan(f"{plan.key}.json") != plan:
+        if not made and self.read_plan(f"{plan.key}.json") != plan:
             raise StoreError(f"{self.where}/{key}: holds another plan of this name; give this one another store")
+        self._recorded[plan.key] = plan
 
     def plans(self) -> tuple[Plan, ...]:
         """The plans, in order of name.
@@ -168,7 +171,20 @@ class Store:
         Raises:
             StoreError: a manifest is damaged or foreign.
         """
-        return [part.manifest for part in self._parts(plan_key)]
+        return [part.manifest for part in self.parts(plan_key)]
+
+    def parts(self, plan_key: str | None = None) -> list[Part]:
+        """What counts of which shard, in order; raises as `committed` does."""
+        return parts_of(reader.read_manifests(reader.committed_shards(self.place, plan_key)))
+
+    def tables_of(self, part: Part) -> tuple[Any, Any]:
+        """The rollouts and the interactions of a shard that count, as tables.
+
+        Raises:
+            StoreError: a file is damaged or foreign.
+        """
+        rollouts = part.of(reader.read_rollout_table(self._shard(part), part.manifest))
+        return rollouts, self._interactions(part, INTERACTION_SCHEMA.names)
 
     def holds(self, job: Job) -> bool:
         """Whether the shard of a job is committed."""
@@ -227,7 +243,7 @@ class Store:
         """Content digest of the store, or of one plan: independent of shards, workers, hosts and times."""
         return combined_digest(
             (part.manifest.plan_key, index, part.manifest.digests[index - part.manifest.start])
-            for part in self._parts(plan_key)
+            for part in self.parts(plan_key)
             for index in range(part.start, part.stop)
         )
 
@@ -250,7 +266,7 @@ class Store:
                 hint = f"did you mean '{close[0]}'?" if close else f"allowed: {', '.join(INTERACTION_SCHEMA.names)}"
                 raise UsageError(f"no column '{name}' in the interactions; {hint}")
         schema = pa.schema([INTERACTION_SCHEMA.field(name) for name in names])
-        parts = [part for part in self._parts() if plan_keys is None or part.manifest.plan_key in plan_keys]
+        parts = [part for part in self.parts() if plan_keys is None or part.manifest.plan_key in plan_keys]
         tables = [_with_shard(self._interactions(part, names), part.manifest.shard_id) for part in parts]
         return pa.concat_tables([_with_shard(schema.empty_table(), ""), *tables])
 
@@ -262,7 +278,7 @@ class Store:
         """
         tables = [
             _with_shard(part.of(reader.read_rollout_table(self._shard(part), part.manifest)), part.manifest.shard_id)
-            for part in self._parts()
+            for part in self.parts()
         ]
         return pa.concat_tables([_with_shard(ROLLOUT_SCHEMA.empty_table(), ""), *tables])
 
@@ -327,10 +343,6 @@ class Store:
                 Path(gettempdir()) / f"adaafford-underway-{hashlib.sha256(self.where.encode()).hexdigest()[:16]}"
             )
         return Underway(self.path / UNDERWAY_FOLDER)
-
-    def _parts(self, plan_key: str | None = None) -> list[Part]:
-        """What of which shard counts."""
-        return parts_of(reader.read_manifests(reader.committed_shards(self.place, plan_key)))
 
     def _interactions(self, part: Part, names: Sequence[str]) -> Any:
         """Some columns of the rows that count."""

@@ -1,0 +1,174 @@
+"""Export: a store as plain files for people who want no store, with a card that says what they are.
+
+OUT/
+  README.md                      the data card
+  setting.json                   how all of it was collected
+  <split>/interactions.parquet   one row an interaction, failures included
+  <split>/observations.zarr/     the clouds that the rows' "observation" counts
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import BloscCodec
+
+from shared.errors import StoreError, UsageError
+from shared.files import remove_tree, temporary_name
+from shared.seeds import generator
+from shared.store.columns import INTERACTION_COLUMNS
+from shared.store.datacard import SplitFigures, data_card
+from shared.store.observations import ARRAYS, ObservationArrays
+from shared.store.store import Store
+from shared.store.tables import schema_of
+
+CLOUDS_A_CHUNK = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """What an export wrote."""
+
+    out: str
+    splits: dict[str, SplitFigures]
+
+
+def splits_by_share(store: Store, test_share: float, seed: int) -> dict[str, frozenset[str]]:
+    """Objects drawn at random within each category: "train" and, if the share is above 0, "test".
+
+    Raises:
+        UsageError: the share is not one.
+    """
+    if not 0 <= test_share < 1:
+        raise UsageError(f"--test-share {test_share} is not allowed; choose 0 to below 1")
+    test: set[str] = set()
+    by_category: dict[str, list[str]] = {}
+    for ref in store.setting.objects:
+        by_category.setdefault(ref.category, []).append(ref.id)
+    for category, ids in sorted(by_category.items()):
+        count = round(test_share * len(ids))
+        test |= set(generator(seed, f"export/{category}").choice(sorted(ids), count, replace=False).tolist())
+    train = {ref.id for ref in store.setting.objects} - test
+    return {"train": frozenset(train)} | ({"test": frozenset(test)} if test_share else {})
+
+
+def export(
+    store: Store,
+    out: Path,
+    splits: Mapping[str, frozenset[str]],
+    progress: Callable[[int, int], None] | None = None,
+) -> Export:
+    """Write a store as plain files: all of it or nothing.
+
+    Args:
+        store: what is written.
+        out: a folder that is not there yet.
+        splits: objects of each split; rows of objects in none are left out.
+        progress: called after each shard with how many are done and how many there are.
+
+    Raises:
+        UsageError: the folder is there, or cannot be made; or an object is in two splits, or in no store.
+        StoreError: the store is damaged, or a split comes out empty.
+    """
+    _check_splits(store, splits)
+    if out.exists():
+        raise UsageError(f"{out}: is there already; name a new folder")
+    temporary = out.parent / temporary_name(out.name)
+    try:
+        temporary.mkdir(parents=True)
+        writers = {name: _SplitWriter(temporary / name, store, objects) for name, objects in splits.items()}
+        parts = store.parts()
+        for done, part in enumerate(parts, 1):
+            tables = store.tables_of(part)
+            clouds = store.read_observations(part.manifest.shard_id)
+            for writer in writers.values():
+                writer.add(*tables, clouds)
+            if progress is not None:
+                progress(done, len(parts))
+        figures = {name: writer.finish() for name, writer in writers.items()}
+        (temporary / "setting.json").write_text(json.dumps(store.setting.model_dump(mode="json"), indent=2) + "\n")
+        (temporary / "README.md").write_text(data_card(store, figures), encoding="utf-8")
+        temporary.rename(out)
+    except OSError as error:
+        raise UsageError(f"{out}: cannot be written ({error.strerror}); name another folder") from None
+    finally:
+        remove_tree(temporary)
+    return Export(str(out), figures)
+
+
+def _check_splits(store: Store, splits: Mapping[str, frozenset[str]]) -> None:
+    known = {ref.id for ref in store.setting.objects}
+    seen: set[str] = set()
+    for name, objects in splits.items():
+        for odd, what in ((objects - known, "is not in the store"), (objects & seen, "is in another split too")):
+            if odd:
+                raise UsageError(f"split '{name}': object '{min(odd)}' {what}; list each object of the store once")
+        seen |= objects
+
+
+class _SplitWriter:
+    """One split's files, shard by shard, so that memory does not grow with the store."""
+
+    def __init__(self, folder: Path, store: Store, objects: frozenset[str]) -> None:
+        folder.mkdir()
+        self._name, self._objects = folder.name, pa.array(sorted(objects), pa.string())
+        self._rows = pq.ParquetWriter(
+            folder / "interactions.parquet", schema_of(INTERACTION_COLUMNS), compression="zstd"
+        )
+        self._clouds = zarr.create_group(folder / "observations.zarr", zarr_format=3)
+        points = store.setting.collection.camera.points
+        for kind in ARRAYS:
+            self._clouds.create_array(
+                kind.name,
+                shape=(0, *kind.shape(points)),
+                dtype=kind.kept,
+                chunks=(CLOUDS_A_CHUNK, *kind.shape(points)),
+                compressors=BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"),
+                attributes={"description": kind.description},
+            )
+        self._written = 0
+        self._figures = SplitFigures.nothing()
+
+    def add(self, rollouts: Any, rows: Any, clouds: ObservationArrays) -> None:
+        """Take what belongs to the split of a shard's two tables and its clouds."""
+        rollouts, rows = (t.filter(pc.is_in(t.column("object_id"), value_set=self._objects)) for t in (rollouts, rows))
+        numbers = list(_observations_of(rollouts))
+        places = np.full(len(clouds), -1, np.int32)
+        places[numbers] = self._written + np.arange(len(numbers), dtype=np.int32)
+        column = rows.schema.get_field_index("observation")
+        renumbered = pa.array(places[rows.column("observation").to_numpy()], pa.int32())
+        self._rows.write_table(rows.set_column(column, rows.schema.field(column), renumbered))
+        self._append(clouds, np.array(numbers, np.int64))
+        self._written += len(numbers)
+        self._figures = self._figures.with_rows(rollouts, rows, len(numbers))
+
+    def finish(self) -> SplitFigures:
+        """Close the files.
+
+        Raises:
+            StoreError: there is not one row.
+        """
+        self._rows.close()
+        if not self._figures.interactions:
+            raise StoreError(f"split '{self._name}' has no interaction; list other objects, or collect more")
+        return self._figures
+
+    def _append(self, clouds: ObservationArrays, numbers: NDArray[np.int64]) -> None:
+        for kind in ARRAYS:
+            array: Any = self._clouds[kind.name]
+            if len(numbers):
+                array.append(kind.pack(getattr(clouds, kind.name)[numbers]))
+
+
+def _observations_of(rollouts: Any) -> Iterator[int]:
+    """Indices in the shard of the observations of some rollouts."""
+    for row in rollouts.select(["first_observation", "observations"]).to_pylist():
+        yield from range(row["first_observation"], row["first_observation"] + row["observations"])

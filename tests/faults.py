@@ -1,0 +1,120 @@
+"""Faults at every write step of a store: what fails, when, and how many steps there are.
+
+with disk_faults(Fault("ENOSPC", step=7)) as steps: ...    # raises from the seventh step; len(steps) counts them
+"""
+
+import errno
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from obstore.exceptions import GenericError
+
+from shared.store.bucket import BucketPlace
+
+DISK_CALLS = ("open", "write", "fsync", "mkdir", "rename", "link", "unlink", "rmdir")
+BUCKET_CALLS = ("put", "copy", "delete")
+DISK_FAULTS = ("ENOSPC", "EIO", "late EIO", "short write", "short write, then ENOSPC")
+BUCKET_FAULTS = ("refused", "answer lost")
+KILLS = ("kill before", "kill after")
+
+
+@dataclass(slots=True)
+class Fault:
+    """A fault of some kind at the n-th step, counted from 1; 0 for none."""
+
+    kind: str
+    step: int
+    steps: list[str] = field(default_factory=list)
+    """Names of the calls so far."""
+    lock: Any = field(default_factory=threading.Lock)
+
+    def call(self, name: str, real: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Do one step, or let it fail."""
+        with self.lock:
+            self.steps.append(name)
+            hit = len(self.steps) == self.step
+            after_short = self.kind.endswith("then ENOSPC") and len(self.steps) == self.step + 1
+        if after_short and name == "write":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if not hit:
+            return real(*args, **kwargs)
+        match self.kind:
+            case "ENOSPC" | "EIO":
+                code = getattr(errno, self.kind)
+                raise OSError(code, os.strerror(code))
+            case "late EIO":
+                done = real(*args, **kwargs)
+                if name == "open":
+                    os.close(done)
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            case "short write" | "short write, then ENOSPC" if name == "write":
+                descriptor, data = args
+                return real(descriptor, data[: max(1, len(data) // 2)])
+            case "refused":
+                raise GenericError("503 Slow Down")
+            case "answer lost":
+                real(*args, **kwargs)
+                raise GenericError("connection reset")
+            case "kill before":
+                os.kill(os.getpid(), signal.SIGKILL)
+            case "kill after":
+                try:
+                    real(*args, **kwargs)
+                finally:
+                    os.kill(os.getpid(), signal.SIGKILL)
+        return real(*args, **kwargs)
+
+
+@contextmanager
+def disk_faults(fault: Fault) -> Iterator[list[str]]:
+    """Let a step of writing to a disk fail, whoever does it."""
+    real = {name: getattr(os, name) for name in DISK_CALLS}
+
+    def wrap(name: str) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if name == "open" and not args[1] & os.O_CREAT:
+                return real[name](*args, **kwargs)
+            return fault.call(name, real[name], *args, **kwargs)
+
+        return call
+
+    try:
+        for name in DISK_CALLS:
+            setattr(os, name, wrap(name))
+        yield fault.steps
+    finally:
+        for name, function in real.items():
+            setattr(os, name, function)
+
+
+class _FaultyClient:
+    """An obstore client whose writes fail."""
+
+    def __init__(self, real: Any, fault: Fault) -> None:
+        self._real, self._fault = real, fault
+
+    def __getattr__(self, name: str) -> Any:
+        real = getattr(self._real, name)
+        if name not in BUCKET_CALLS:
+            return real
+        return lambda *args, **kwargs: self._fault.call(name, real, *args, **kwargs)
+
+
+@contextmanager
+def bucket_faults(fault: Fault) -> Iterator[list[str]]:
+    """Let a step of writing to a bucket fail, in places that are opened within the context."""
+    init = BucketPlace.__init__
+
+    def faulty(self: BucketPlace, where: str, client: Any) -> None:
+        init(self, where, _FaultyClient(client, fault))
+
+    try:
+        BucketPlace.__init__ = faulty  # type: ignore[method-assign]
+        yield fault.steps
+    finally:
+        BucketPlace.__init__ = init  # type: ignore[method-assign]
