@@ -42,6 +42,7 @@ bench: $(STAMP)  ## Fidelity, dynamics and speed of push and pull, and of learni
 	  echo "== bench $$what, $$task"; \
 	  $(BIN)/adaafford bench $$what --task $$task $(if $(OBJECTS),--objects $(OBJECTS)) --out benchmarks || exit 1; \
 	done; done
+	$(BIN)/adaafford bench store --out benchmarks
 	$(BIN)/adaafford bench learner --out benchmarks
 	$(BIN)/adaafford bench adapt --out benchmarks
 

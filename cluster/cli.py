@@ -23,7 +23,7 @@ COMMANDS = {
     "train": "prior, aap, aip or alternate: train from a store alone",
     "store": "info, verify, digest, replay, repair, compact, merge or export: look after stores",
     "objects": "generate, check, preview or decompose: the objects",
-    "bench": "fidelity, dynamics, collect, learner or adapt: measure how fast and how true each part is",
+    "bench": "fidelity, dynamics, collect, store, learner or adapt: measure how fast and how true each part is",
     "version": "print the version",
 }
 """Subcommands, each a module of `cluster.commands` with `main(args) -> int`."""

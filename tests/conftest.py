@@ -6,8 +6,6 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     # Before any test module imports torch: small work on many threads is slower, and other processes want the cores.
     os.environ.setdefault(_name, "1")
 
-import subprocess  # noqa: E402
-import sys  # noqa: E402
 import uuid  # noqa: E402
 from collections.abc import Iterator  # noqa: E402
 from pathlib import Path  # noqa: E402
@@ -40,13 +38,10 @@ def real_objects() -> Path:
 @pytest.fixture(scope="session")
 def s3_endpoint() -> Iterator[str]:
     """Address of an S3 server on loopback that lives as long as the tests."""
-    command = [sys.executable, "-m", "tests.s3_server"]
-    root = Path(__file__).parents[1]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=root) as server:
-        assert server.stdout is not None
-        yield f"http://127.0.0.1:{int(server.stdout.readline())}"
-        assert server.stdin is not None
-        server.stdin.close()
+    from cluster.benchmarks.s3_server import loopback_server
+
+    with loopback_server() as endpoint:
+        yield endpoint
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import zarr
 
+from cluster.benchmarks.storing import StoringBenchmark
 from cluster.cli import run
 from shared.errors import StoreError, UsageError
 from shared.observation import pack_normals
@@ -194,3 +195,15 @@ def test_the_commands_say_what_they_did(tmp_path: Path, capsys: pytest.CaptureFi
     assert said[2]["splits"]["train"]["interactions"] == 8
     assert run(["store", "export", str(store.path), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_benchmark_reads_what_was_committed(tmp_path: Path) -> None:
+    store = make(tmp_path / "store", (0, 1), (1, 4))
+    benchmark, turns = StoringBenchmark(store, repeats=2, bucket=True), []
+    benchmark.run(lambda: turns.append(1))
+    assert len(turns) == benchmark.turns == 4
+    found = benchmark.as_json()
+    assert (found["shards"], found["interactions"]) == (2, 8)
+    assert list(found["read"]) == ["disk, cold", "disk, warm", "bucket"]
+    assert all(value > 0 for figures in found["read"].values() for value in figures.values())
+    assert {name: len(each) for name, each in benchmark.commit_s.items()} == {"disk": 4, "bucket": 4}

@@ -20,7 +20,7 @@ from shared.vocabulary import Primitive
 if TYPE_CHECKING:
     from shared.plan import Plan
 
-ACTIONS = ("fidelity", "dynamics", "collect", "learner", "adapt")
+ACTIONS = ("fidelity", "dynamics", "collect", "store", "learner", "adapt")
 
 
 class BenchSettings(ObjectSelection):
@@ -106,6 +106,10 @@ def main(args: list[str]) -> int:
             return _dynamics(parse_flags(DynamicsCommand, args[1:], "bench dynamics").settings)
         case ["collect"]:
             return _collect(parse_flags(CollectCommand, args[1:], "bench collect").settings)
+        case ["store"]:
+            from cluster.commands.bench_store import store
+
+            return store(args[1:])
         case ["learner"]:
             from cluster.commands.bench_learner import learner
 

@@ -26,8 +26,8 @@ class StoredSettings(BenchSettings):
     """Of the store that is made where none is given."""
     procedural_per_category: int = Field(8, ge=1, le=10_000)
     """Its built-in objects: how many of each category that the task applies to."""
-    store: Path | None = None
-    """A store to read; a small one is made where none is given."""
+    store: str | None = None
+    """Folder or s3:// URL of a store to read; a small one is made where none is given."""
     rollouts: int = Field(32, ge=2, le=1_000_000)
     """Of the store that is made."""
     threads: int | None = Field(None, ge=1, le=1024)
@@ -69,12 +69,12 @@ def learner(args: list[str]) -> int:
     from cluster.benchmarks.learning import LearningBenchmark
     from learner.configuration import LearnerConfig
 
-    with _stored(command) as store:
+    with stored(command) as store:
         config = LearnerConfig(seed=command.seed)
         benchmark = LearningBenchmark(store, config, command.repeats, command.steps, command.port_interactions)
         with progress("turns of training, and of the published step", benchmark.turns) as advance:
             benchmark.run(advance)
-        result = benchmark.as_json() | _source(command, store)
+        result = benchmark.as_json() | source_of(command, store)
     _print_learner(result)
     return finish(command, "learner", result)
 
@@ -86,12 +86,12 @@ def adapt(args: list[str]) -> int:
     from shared.networks.configuration import NetworkConfig
     from shared.policy import Policy
 
-    with _stored(command) as store:
+    with stored(command) as store:
         policy = Policy.untrained(store.setting.task, NetworkConfig(), command.seed)
         benchmark = AdaptationBenchmark(store, policy, command.repeats)
         with progress("rollouts of test-time steps", benchmark.turns) as advance:
             benchmark.run(advance)
-        result = benchmark.as_json() | _source(command, store)
+        result = benchmark.as_json() | source_of(command, store)
     print(f"{result['steps']} steps at each size, {result['threads']} threads; medians in ms")
     print(f"  {'points':>7}{'propose':>9}{'update':>9}{'step':>9}{'known observation':>20}")
     for size, figures in result["milliseconds"].items():
@@ -111,14 +111,14 @@ def _print_learner(result: dict[str, Any]) -> None:
     print(f"AAP is {result['times_straightforward_port']:,.0f} times the straightforward port")
 
 
-def _source(command: StoredSettings, store: "Store") -> dict[str, str]:
+def source_of(command: StoredSettings, store: "Store") -> dict[str, str]:
     """What the figures were measured on."""
-    named = {} if command.store is None else {"objects_from": f"store-{command.store.name}"}
+    named = {} if command.store is None else {"objects_from": f"store-{command.store.rstrip('/').rpartition('/')[2]}"}
     return {"task": store.setting.task} | named
 
 
 @contextmanager
-def _stored(command: StoredSettings) -> Iterator["Store"]:
+def stored(command: StoredSettings) -> Iterator["Store"]:
     """The store to read: the one that was named, or one of random interactions that lasts as long as the context."""
     task_named(command.task)
     import torch

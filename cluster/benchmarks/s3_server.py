@@ -1,0 +1,78 @@
+"""An S3 server on loopback, in a process of its own, for measuring and for tests; a development dependency (moto)."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from shared.errors import UsageError, WorkerError
+
+BUCKET = "adaafford"
+
+
+def serve() -> None:
+    """Serve until standard input ends; the port is printed first."""
+    import logging
+    import urllib.request
+
+    from moto.server import ThreadedMotoServer
+
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    urllib.request.urlopen(urllib.request.Request(f"http://{host}:{port}/{BUCKET}", method="PUT")).close()
+    print(port, flush=True)
+    sys.stdin.read()
+    server.stop()
+
+
+@contextmanager
+def loopback_server() -> Iterator[str]:
+    """Address of a server with one empty bucket, `BUCKET`.
+
+    Raises:
+        UsageError: moto is not installed.
+        WorkerError: the server did not start.
+    """
+    if importlib.util.find_spec("moto") is None:
+        raise UsageError("an S3 server on loopback needs the development dependencies; install adaafford[dev]")
+    command = [sys.executable, "-m", "cluster.benchmarks.s3_server"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdin is not None
+        assert server.stdout is not None
+        try:
+            port = server.stdout.readline().strip()
+            if not port.isdigit():
+                raise WorkerError("the S3 server on loopback did not start")
+            yield f"http://127.0.0.1:{port}"
+        finally:
+            server.stdin.close()
+
+
+@contextmanager
+def loopback_bucket() -> Iterator[str]:
+    """An s3:// URL on such a server, which this process's environment names meanwhile."""
+    with loopback_server() as endpoint:
+        named = {
+            "AWS_ENDPOINT_URL": endpoint,
+            "AWS_ACCESS_KEY_ID": "loopback",
+            "AWS_SECRET_ACCESS_KEY": "loopback",
+            "AWS_REGION": "us-east-1",
+        }
+        before = {name: value for name, value in os.environ.items() if name.startswith("AWS_")}
+        for name in before:
+            del os.environ[name]
+        os.environ.update(named)
+        try:
+            yield f"s3://{BUCKET}/benchmark"
+        finally:
+            for name in named:
+                del os.environ[name]
+            os.environ.update(before)
+
+
+if __name__ == "__main__":
+    serve()
