@@ -22,6 +22,8 @@ from shared.store.place import URL_SCHEME, Publication
 
 AT_ONCE = 16
 """Requests under way at the same time; each waits for the network most of its time."""
+WINDOW = 8 * AT_ONCE
+"""Answers that may wait to be used."""
 MAX_RETRIES = 10
 RETRY_TIMEOUT_S = 120
 REQUEST_TIMEOUT_S = 60
@@ -166,7 +168,9 @@ class BucketPlace:
     def _map(self, act: Callable[[Any], Answer], items: Sequence[Any]) -> Iterator[Answer]:
         if self._pool is None:
             self._pool = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="bucket")
-        return self._pool.map(act, items)
+        # In windows, since a pool would otherwise fetch all of a large store before the first answer is used.
+        for start in range(0, len(items), WINDOW):
+            yield from self._pool.map(act, items[start : start + WINDOW])
 
     def _ask(self, request: Callable[[], Answer], key: str, *, missing_is_error: bool = True) -> Answer:
         """Do a request, with one line for whatever may go wrong after all retries."""

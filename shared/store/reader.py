@@ -136,16 +136,38 @@ def _checked(shard: Folder, manifest: ShardManifest, name: str, data: bytes) -> 
     return data
 
 
-def read_interactions(shard: Folder, manifest: ShardManifest, names: Sequence[str] | None = None) -> Any:
-    """The table of a shard's interactions, or some columns of it."""
+def read_interactions(shard: Folder, manifest: ShardManifest) -> Any:
+    """The table of a shard's interactions."""
     data = read_file(shard, manifest, INTERACTIONS_FILE)
-    return read_table(data, INTERACTION_SCHEMA, manifest.interactions, f"{shard}/{INTERACTIONS_FILE}", names)
+    return read_table(data, INTERACTION_SCHEMA, manifest.interactions, f"{shard}/{INTERACTIONS_FILE}")
 
 
 def read_rollout_table(shard: Folder, manifest: ShardManifest) -> Any:
     """The table of a shard's rollouts."""
     data = read_file(shard, manifest, ROLLOUTS_FILE)
     return read_table(data, ROLLOUT_SCHEMA, manifest.rollouts, f"{shard}/{ROLLOUTS_FILE}")
+
+
+def read_many_interactions(
+    place: Place, manifests: Sequence[ShardManifest], names: Sequence[Sequence[str]]
+) -> Iterator[Any]:
+    """Some columns of the interactions of many shards, which a bucket gives at once; raises as `read_file` does."""
+    return _read_tables(place, manifests, INTERACTIONS_FILE, INTERACTION_SCHEMA, names)
+
+
+def read_many_rollout_tables(place: Place, manifests: Sequence[ShardManifest]) -> Iterator[Any]:
+    """The rollouts of many shards, likewise."""
+    return _read_tables(place, manifests, ROLLOUTS_FILE, ROLLOUT_SCHEMA, [None] * len(manifests))
+
+
+def _read_tables(
+    place: Place, manifests: Sequence[ShardManifest], file: str, schema: Any, names: Sequence[Sequence[str] | None]
+) -> Iterator[Any]:
+    shards = [shard_folder(place, manifest.shard_id) for manifest in manifests]
+    wanted = [(f"{shard.key}/{file}", m.files[file].size) for shard, m in zip(shards, manifests, strict=True)]
+    for shard, manifest, columns, data in zip(shards, manifests, names, place.read_all(wanted), strict=True):
+        rows = manifest.interactions if file == INTERACTIONS_FILE else manifest.rollouts
+        yield read_table(_checked(shard, manifest, file, data), schema, rows, f"{shard}/{file}", columns)
 
 
 def read_observations(shard: Folder, manifest: ShardManifest) -> ObservationArrays:

@@ -183,8 +183,9 @@ class Store:
         Raises:
             StoreError: a file is damaged or foreign.
         """
-        rollouts = part.of(reader.read_rollout_table(self._shard(part), part.manifest))
-        return rollouts, self._interactions(part, INTERACTION_SCHEMA.names)
+        shard = reader.shard_folder(self.place, part.manifest.shard_id)
+        rollouts = reader.read_rollout_table(shard, part.manifest)
+        return part.of(rollouts), part.of(reader.read_interactions(shard, part.manifest))
 
     def holds(self, job: Job) -> bool:
         """Whether the shard of a job is committed."""
@@ -267,7 +268,12 @@ class Store:
                 raise UsageError(f"no column '{name}' in the interactions; {hint}")
         schema = pa.schema([INTERACTION_SCHEMA.field(name) for name in names])
         parts = [part for part in self.parts() if plan_keys is None or part.manifest.plan_key in plan_keys]
-        tables = [_with_shard(self._interactions(part, names), part.manifest.shard_id) for part in parts]
+        wanted = [names if part.is_whole else list(dict.fromkeys([*names, ROLLOUT_COLUMN])) for part in parts]
+        found = reader.read_many_interactions(self.place, [part.manifest for part in parts], wanted)
+        tables = [
+            _with_shard(part.of(table).select(names), part.manifest.shard_id)
+            for part, table in zip(parts, found, strict=True)
+        ]
         return pa.concat_tables([_with_shard(schema.empty_table(), ""), *tables])
 
     def rollouts(self) -> Any:
@@ -276,10 +282,9 @@ class Store:
         Raises:
             StoreError: a file is damaged or foreign.
         """
-        tables = [
-            _with_shard(part.of(reader.read_rollout_table(self._shard(part), part.manifest)), part.manifest.shard_id)
-            for part in self.parts()
-        ]
+        parts = self.parts()
+        found = reader.read_many_rollout_tables(self.place, [part.manifest for part in parts])
+        tables = [_with_shard(part.of(table), part.manifest.shard_id) for part, table in zip(parts, found, strict=True)]
         return pa.concat_tables([_with_shard(ROLLOUT_SCHEMA.empty_table(), ""), *tables])
 
     def read_observations(self, shard_id: str) -> ObservationArrays:
@@ -343,14 +348,6 @@ class Store:
                 Path(gettempdir()) / f"adaafford-underway-{hashlib.sha256(self.where.encode()).hexdigest()[:16]}"
             )
         return Underway(self.path / UNDERWAY_FOLDER)
-
-    def _interactions(self, part: Part, names: Sequence[str]) -> Any:
-        """Some columns of the rows that count."""
-        wanted = names if part.is_whole else [*names, ROLLOUT_COLUMN]
-        return part.of(reader.read_interactions(self._shard(part), part.manifest, wanted)).select(names)
-
-    def _shard(self, part: Part) -> Folder:
-        return reader.shard_folder(self.place, part.manifest.shard_id)
 
     def _committed_shard(self, shard_id: str) -> Folder:
         folder = reader.shard_folder(self.place, shard_id)
