@@ -147,12 +147,12 @@ class BucketPlace:
         return self.create(mark, publication.describe(held))
 
     def move(self, key: str, new: str) -> None:
-        """See `Place.move`; what is first in the listing of a folder goes last, and its mark first."""
+        """See `Place.move`: everything is copied before anything goes."""
         leaves = self.leaves(key) or ([key] if self.exists(key) else [])
         for leaf in leaves:
             target = new + leaf[len(key) :]
             self._ask(lambda leaf=leaf, target=target: self._client.copy(leaf, target), leaf)  # type: ignore[misc]
-        # The mark lies directly in the folder, and the folder no longer counts once it is gone.
+        # The mark, a document directly in the folder, goes first: from then on the folder does not count.
         for leaf in sorted(leaves, key=lambda leaf: (leaf.count("/"), not leaf.endswith(".json"), leaf)):
             self._ask(lambda leaf=leaf: self._client.delete(leaf), leaf)  # type: ignore[misc]
 
