@@ -11,15 +11,15 @@ The same live workers serve every collection round; each round's policy reaches 
 
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from cluster.collection import Collected, collect
+from cluster.collection import collect
 from cluster.configuration import CampaignConfig
+from cluster.evaluation import Evaluation, figures_of
 from cluster.fleet import Fleet, make_worker
 from cluster.ledger import Ledger
 from cluster.locking import only_driver
@@ -30,7 +30,7 @@ from cluster.stages import Stage, run_stages
 from cluster.training import Trainer
 from shared.errors import UsageError
 from shared.files import write_atomically
-from shared.methods import baselines_of, versions_of
+from shared.methods import baselines_of
 from shared.plan import Plan, Setting
 from shared.store import Store
 from shared.tasks import task_named
@@ -151,25 +151,29 @@ class Campaign:
 
     def _collect(self, crew: Crew, proposer: str, version: int, rollouts: int) -> Mapping[str, Any]:
         """One collection round."""
-        return self._fill(crew, self._run.store, proposer, version, rollouts)
+        store, folder = Store.open(self._run.store), Path(self._run.objects_used().folder)
+        plan = Plan(setting=store.setting, proposer=proposer, policy_version=version)
+        open_fleet = partial(crew.for_store, store, folder)
+        with store.only_driver():
+            collected = collect(store, plan, rollouts, self._config.rollouts.per_shard, open_fleet, folder)
+        return figures_of(collected)
 
     def _evaluate(self, crew: Crew, version: int) -> Mapping[str, Any]:
-        """Try every method on unseen objects with the last policy, then ask the critics about the rest."""
-        evaluation = Store.open(self._run.evaluation)
-        for used in versions_of(self._config.evaluation.methods, version):
-            evaluation.publish_policy(used, Store.open(self._run.store).read_policy(used))
-        collected = self._fill(crew, self._run.evaluation, "evaluation", version, self._config.rollouts.evaluation)
-        crew.dismiss()
-        return collected | dict(self._trainer.evaluate(version))
-
-    def _fill(self, crew: Crew, path: Path, proposer: str, version: int, rollouts: int) -> dict[str, Any]:
-        store, used = Store.open(path), self._run.objects_used()
-        plan = Plan(setting=store.setting, proposer=proposer, policy_version=version)
-        folder = Path(used.folder)
-        open_fleet = partial(crew.for_store, store, folder)
-        with only_driver(path):
-            collected = collect(store, plan, rollouts, self._config.rollouts.per_shard, open_fleet, folder)
-        return _figures(collected)
+        """Try every method on unseen objects with the last policy, and write the table."""
+        run, rollouts = self._run, self._config.rollouts
+        evaluation = Evaluation(
+            store=Store.open(run.evaluation),
+            policies=Store.open(run.store),
+            version=version,
+            rollouts=rollouts.evaluation,
+            per_shard=rollouts.per_shard,
+            objects=Path(run.objects_used().folder),
+            oracle=run.oracle,
+            out=run.training("evaluate"),
+        )
+        open_fleet = partial(crew.for_store, evaluation.store, evaluation.objects)
+        collected = evaluation.execute(open_fleet, crew.dismiss, self._say)
+        return {**figures_of(collected), "policy": version}
 
     def _report(self) -> Mapping[str, Any]:
         """Write summary.json and affordance.png."""
@@ -180,8 +184,3 @@ class Campaign:
 
     def _say(self, line: str) -> None:
         self._console.print(line, markup=False, soft_wrap=True)
-
-
-def _figures(collected: Collected) -> dict[str, Any]:
-    """What the ledger notes of a collection: of the last attempt alone, as the wall time is."""
-    return {"tally": asdict(collected.tally), "wall_s": collected.seconds, "workers": collected.workers}

@@ -18,6 +18,7 @@ INTERRUPTED = 130
 COMMANDS = {
     "run": "collect, train, collect with what was learnt, evaluate: a whole campaign",
     "resume": "go on with a run that was stopped",
+    "evaluate": "the table of the paper: F-score and sample-success of all methods, on any objects",
     "report": "print a run's results again",
     "collect": "collect interactions into a store, without any learning",
     "train": "prior, aap, aip or alternate: train from a store alone",
@@ -28,7 +29,7 @@ COMMANDS = {
 }
 """Subcommands, each a module of `cluster.commands` with `main(args) -> int`."""
 
-RESUMABLE = ("run", "resume", "collect", "train")
+RESUMABLE = ("run", "resume", "collect", "train", "evaluate")
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells more\n\n" + "\n".join(
     f"  {name:<9}{text}" for name, text in COMMANDS.items()

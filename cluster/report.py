@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from cluster.configuration import CampaignConfig
+from cluster.evaluation_tables import RESULTS_FILE
 from cluster.figures import collection_figures
-from cluster.judging import RESULTS_FILE
 from cluster.ledger import Ledger
 from cluster.run_folder import RunFolder, read_json
 from shared.errors import UsageError

@@ -86,6 +86,11 @@ class RunFolder:
         """affordance.png."""
         return self.path / "affordance.png"
 
+    @property
+    def oracle(self) -> Path:
+        """The training stage that may have left an oracle."""
+        return self.training("aap-1")
+
     def training(self, stage: str) -> Path:
         """What a training stage leaves."""
         return self.path / "training" / stage

@@ -62,13 +62,6 @@ class Trainer:
         self._say(f"published policy {version}, {sum(map(len, files.values())) / 1e6:.1f} MB")
         return {"policy": version}
 
-    def evaluate(self, version: int) -> Mapping[str, Any]:
-        """Judge the policy by what was tried on unseen objects."""
-        out = self._run.training("evaluate")
-        arguments = [str(self._run.evaluation), str(version), str(out), str(self._run.training("aap-1"))]
-        run_child("cluster.judging", arguments, out, self._say)
-        return {"policy": version}
-
     def _train(self, network: str, stage: str, init: str | None) -> dict[str, Any]:
         out = self._run.training(stage)
         out.mkdir(parents=True, exist_ok=True)

@@ -12,9 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from learner.bootstrap import ratio_interval
 from learner.critics import OracleScores, RowCritic, row_critic
 from learner.data import Dataset, load_dataset
-from learner.metrics import discrimination
+from learner.metrics import THRESHOLD, discrimination
 from learner.oracle import OracleCritic
 from shared.errors import StoreError
 from shared.methods import METHODS, CriticName, method_named
@@ -46,6 +47,10 @@ class EvaluationRow:
         sample_success: share of the EXPLOIT rows that succeeded.
         trials: how many EXPLOIT rows.
         mean_tries: tries made a rollout, which stopping may leave below the budget.
+        f_score_low: where its 95% interval over objects begins.
+        f_score_high: where it ends.
+        sample_success_low: where its 95% interval over objects begins.
+        sample_success_high: where it ends.
     """
 
     task: str
@@ -60,6 +65,10 @@ class EvaluationRow:
     sample_success: float
     trials: int
     mean_tries: float
+    f_score_low: float
+    f_score_high: float
+    sample_success_low: float
+    sample_success_high: float
 
 
 def evaluate_store(
@@ -147,6 +156,10 @@ class _Judge:
         if not sum(map(len, self.queries)):
             raise StoreError("the store holds no query to judge by; evaluate on a store made by an evaluation plan")
         self._critics: dict[tuple[CriticName, int], RowCritic] = {}
+        objects = sorted(set(dataset.objects))
+        self._object_of = np.zeros(len(rows.success), dtype=np.int64)
+        for index, name in zip(dataset.rollouts, dataset.objects, strict=True):
+            self._object_of[index.numpy()] = objects.index(name)
 
     def critic(self, name: CriticName, version: int) -> RowCritic:
         """A critic of a policy, made once for all methods that share it."""
@@ -159,9 +172,15 @@ class _Judge:
         contexts = [self._context(index, method, budget) for index in self.dataset.rollouts]
         pairs = [pair for pair in zip(self.queries, contexts, strict=True) if len(pair[0])]
         scores = [critic(queries, context) for queries, context in pairs]
-        successes = self.dataset.rows.success[torch.cat([queries for queries, _ in pairs])]
-        found = discrimination(torch.cat(scores).numpy(), successes.numpy())
-        exploits = self._exploits(method, budget)
+        asked = torch.cat([queries for queries, _ in pairs])
+        labels = self.dataset.rows.success[asked].numpy()
+        believed = torch.cat(scores).numpy()
+        found = discrimination(believed, labels)
+        claimed, true = believed >= THRESHOLD, labels > THRESHOLD
+        f_low, f_high = ratio_interval(2.0 * (claimed & true), 1.0 * claimed + true, self._object_of[asked.numpy()])
+        chosen = self._exploits(method, budget)
+        exploits = self.dataset.rows.success.numpy()[chosen].astype(np.float64)
+        success_low, success_high = ratio_interval(exploits, np.ones(len(exploits)), self._object_of[chosen])
         return EvaluationRow(
             task=self.dataset.task,
             method=method,
@@ -175,6 +194,10 @@ class _Judge:
             sample_success=float(exploits.mean()) if len(exploits) else float("nan"),
             trials=len(exploits),
             mean_tries=float(np.mean([len(context) for _, context in pairs])),
+            f_score_low=f_low,
+            f_score_high=f_high,
+            sample_success_low=success_low,
+            sample_success_high=success_high,
         )
 
     def _context(self, index: Tensor, method: str, budget: int) -> Tensor:
@@ -182,10 +205,10 @@ class _Judge:
         rows, numbers = self.dataset.rows, index.numpy()
         return index[(rows.role[numbers] == Role.CONTEXT.value) & (rows.method[numbers] == method)][:budget]
 
-    def _exploits(self, method: str, budget: int) -> NDArray[np.float32]:
-        """Outcomes of the exploits; those of a prior count whatever budget they are listed under."""
+    def _exploits(self, method: str, budget: int) -> NDArray[np.int64]:
+        """Rows of the exploits; those of a prior count whatever budget they are listed under."""
         rows = self.dataset.rows
         chosen = (rows.role == Role.EXPLOIT.value) & (rows.method == method)
         if method != PRIOR_METHOD:
             chosen &= rows.budget == budget
-        return np.asarray(rows.success.numpy()[chosen], dtype=np.float32)
+        return np.flatnonzero(chosen)

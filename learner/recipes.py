@@ -22,8 +22,9 @@ from learner.training import Stage, TrainingResult, train
 from learner.where2act_adaptation import AdaptationStage
 from learner.where2act_interaction import InteractionStage
 from shared.files import write_atomically
+from shared.methods import ModuleName
 from shared.networks.where2act_interaction import TRIES
-from shared.policy import ModuleName, Policy
+from shared.policy import Policy
 from shared.seeds import generator, torch_seed
 
 ORACLE_FILE = "oracle.safetensors"

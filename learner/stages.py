@@ -27,12 +27,12 @@ from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FOLDER, Recipe, Runner
 from learner.training import CHECKPOINT_FILE, METRICS_FILE, TrainingResult, without_nan
 from shared.errors import UsageError
 from shared.files import read_bounded, write_atomically
+from shared.methods import ModuleName
 from shared.policy import (
     MAX_POLICY_JSON_BYTES,
     MAX_WEIGHTS_BYTES,
     POLICY_FILE,
     WEIGHTS_FILE,
-    ModuleName,
     Policy,
 )
 from shared.seeds import torch_seed

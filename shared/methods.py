@@ -12,6 +12,8 @@ from shared.errors import UsageError
 BaselineName = Literal["where2act-interaction", "where2act-adaptation"]
 """Baselines with a network of their own, which are trained only where they are wanted."""
 CriticName = Literal["where2act", "aap", BaselineName]
+ModuleName = Literal["prior", "aap", "aip", BaselineName]
+"""Networks that a policy may hold."""
 TriesName = Literal["random", "aip", "fps", "purefps", "argfps", "where2act-fps"]
 MethodName = Literal[
     "where2act",
@@ -48,6 +50,16 @@ class Method:
     def budgets(self, wanted: Sequence[int]) -> list[int]:
         """The numbers of tries after which it is judged, in ascending order."""
         return sorted(set(wanted)) if self.in_one_shot is None else [self.in_one_shot]
+
+    @property
+    def modules(self) -> tuple[ModuleName, ...]:
+        """The networks that it needs, each once; the prior's proposals serve all."""
+        wanted: list[ModuleName] = ["prior"]
+        if self.critic != "where2act":
+            wanted.append(self.critic)
+        if self.tries in ("aip", "argfps", "fps"):
+            wanted += ["aap", "aip"] if self.tries == "aip" else ["aap"]
+        return tuple(dict.fromkeys(wanted))
 
     def policy_version(self, evaluated: int) -> int:
         """The policy version that it uses where version `evaluated` is evaluated."""

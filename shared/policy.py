@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from shared.configuration import StrictModel
 from shared.errors import StoreError, UsageError
-from shared.methods import BaselineName
+from shared.methods import BaselineName, ModuleName
 from shared.networks.aap import Aap
 from shared.networks.aip import Aip
 from shared.networks.configuration import NetworkConfig
@@ -25,8 +25,6 @@ POLICY_FILE = "policy.json"
 POLICY_SCHEMA = 1
 MAX_POLICY_JSON_BYTES = 1 << 16
 MAX_WEIGHTS_BYTES = 1 << 30
-
-ModuleName = Literal["prior", "aap", "aip", BaselineName]
 
 
 class PolicyDocument(StrictModel):

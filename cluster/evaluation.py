@@ -1,0 +1,88 @@
+"""One evaluation, of a campaign or by itself: trials of every method on unseen objects, then the table.
+
+A trial is one rollout: an object with freshly drawn hidden dynamics and camera, on which every method fills its set of
+interactions anew and then acts. So ten trials a shape (AdaAfford, Evaluation Metrics) are ten rollouts for each object.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from cluster.collection import Collected, OpenFleet, collect
+from cluster.training import run_child
+from shared.methods import METHODS, versions_of
+from shared.plan import EvaluationConfig, Plan
+from shared.policy import Policy
+from shared.store import Store
+
+PROPOSER = "evaluation"
+"""What an evaluation's plan calls its proposer: the methods of its setting."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """What is evaluated, and what with.
+
+    Attributes:
+        store: of the evaluation's setting.
+        policies: a store that holds the policies, which are copied, so that the evaluation stands alone.
+        version: the policy that is evaluated.
+        rollouts: how many trials there shall be in all, those of earlier attempts included.
+        per_shard: trials a shard.
+        objects: folder of the objects.
+        oracle: folder of the training of AAP, which may have left an oracle.
+        out: folder of the table.
+    """
+
+    store: Store
+    policies: Store
+    version: int
+    rollouts: int
+    per_shard: int
+    objects: Path
+    oracle: Path
+    out: Path
+
+    @property
+    def config(self) -> EvaluationConfig:
+        """What is tried on each object."""
+        config = self.store.setting.evaluation
+        assert config is not None, "an evaluation store says what is evaluated"
+        return config
+
+    def execute(self, open_fleet: OpenFleet, dismiss: Callable[[], None], say: Callable[[str], None]) -> Collected:
+        """Do what is left of the trials, and write the table.
+
+        Args:
+            open_fleet: gives the fleet; not called if no trial is left.
+            dismiss: ends the fleet, since the table wants its cores.
+            say: is told what the process that judges prints.
+
+        Raises:
+            UsageError: a method needs networks that are not trained.
+            WorkerError: a job or the judging failed.
+        """
+        self._publish()
+        plan = Plan(setting=self.store.setting, proposer=PROPOSER, policy_version=self.version)
+        with self.store.only_driver():
+            collected = collect(self.store, plan, self.rollouts, self.per_shard, open_fleet, self.objects)
+            dismiss()
+            arguments = [self.store.where, str(self.version), str(self.out), str(self.oracle)]
+            run_child("cluster.judging", arguments, self.out, say)
+        return collected
+
+    def _publish(self) -> None:
+        """Copy the policies that the methods use, after a look at whether they hold all networks that are needed."""
+        for version in versions_of(self.config.methods, self.version):
+            files = self.policies.read_policy(version)
+            policy = Policy.from_files(files)
+            for name in self.config.methods:
+                if METHODS[name].policy_version(self.version) == version:
+                    policy.require(*METHODS[name].modules)
+            self.store.publish_policy(version, files)
+
+
+def figures_of(collected: Collected) -> Mapping[str, Any]:
+    """What a ledger notes of a collection: of the last attempt alone, as the wall time is."""
+    return {"tally": asdict(collected.tally), "wall_s": collected.seconds, "workers": collected.workers}

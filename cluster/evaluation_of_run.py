@@ -1,0 +1,132 @@
+"""An evaluation of a run by itself: which of its policies, on which objects, and where the table goes."""
+
+import hashlib
+import sys
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from cluster.configuration import CampaignConfig
+from cluster.evaluation import Evaluation
+from cluster.evaluation_settings import EvaluateSettings
+from cluster.evaluation_tables import MARKDOWN_FILE, RESULTS_FILE
+from cluster.fleet import Fleet, make_worker
+from cluster.objects import objects_for
+from cluster.run_folder import ObjectsUsed, RunFolder, find
+from cluster.session import fleets
+from collector.guard import Limits
+from shared.errors import UsageError
+from shared.methods import METHODS, MethodName
+from shared.plan import EvaluationConfig, ObjectRef, Setting
+from shared.policy import Policy
+from shared.store import Store
+from shared.tasks import Task, task_named
+
+
+def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> None:
+    """Evaluate a policy of the run in `path`, and print the table.
+
+    Raises:
+        AdaAffordError: the run has no such policy, the objects or methods do not suit, or a worker failed.
+    """
+    run, config = find(path)
+    policies, used = Store.open(run.store), run.objects_used()
+    version = _version(run, policies, settings.policy)
+    policy = Policy.from_files(policies.read_policy(version))
+    task = _task(config, settings.task)
+    refs, folder = _objects(task, settings, used)
+    setting = Setting(
+        kind="evaluation",
+        task=task.name,
+        seed=config.seed if settings.seed is None else settings.seed,
+        objects=refs,
+        collection=task.resolve(config.collection),
+        evaluation=EvaluationConfig(
+            methods=settings.methods or _possible_methods(policy),
+            budgets=settings.budgets,
+            queries=settings.queries,
+        ),
+    )
+    out = out if out is not None else run.path / "evaluations" / _name(setting, folder, version)
+    evaluation = Evaluation(
+        store=Store.create(out / "store", setting),
+        policies=policies,
+        version=version,
+        rollouts=settings.trials * len(refs),
+        per_shard=settings.per_shard,
+        objects=folder,
+        oracle=run.oracle,
+        out=out,
+    )
+    _execute(evaluation, settings)
+    print((out / MARKDOWN_FILE).read_text(encoding="utf-8"), end="")
+    print(f"\n{out / RESULTS_FILE}")
+
+
+def _execute(evaluation: Evaluation, settings: EvaluateSettings) -> None:
+    console = Console(file=sys.stderr, highlight=False)
+    limits = Limits(settings.rollout_limit_s, settings.memory_limit_mb)
+    made: list[Fleet] = []
+    with fleets(settings.workers, limits, settings.ray_address) as make_fleet:
+
+        def open_fleet() -> Fleet:
+            store = evaluation.store
+            made.append(make_fleet(partial(make_worker, store.where, evaluation.objects), store.underway))
+            return made[0]
+
+        def dismiss() -> None:
+            for fleet in made:
+                fleet.close()
+
+        evaluation.execute(open_fleet, dismiss, lambda line: console.print(line, markup=False, soft_wrap=True))
+
+
+def _version(run: RunFolder, policies: Store, wanted: int | None) -> int:
+    known = policies.policy_versions()
+    if not known:
+        raise UsageError(f"{run.path}: has published no policy yet; finish it with `adaafford resume {run.path}`")
+    return known[-1] if wanted is None else wanted
+
+
+def _task(config: CampaignConfig, name: str | None) -> Task:
+    """The task to evaluate on; the networks were trained for one primitive and know no other."""
+    trained, task = task_named(config.task), task_named(name or config.task)
+    if task.primitive is not trained.primitive:
+        raise UsageError(
+            f"the run is trained to {trained.primitive.value} (task '{trained.name}'), and task '{task.name}' needs "
+            f"{task.primitive.value}; name a task of the same primitive"
+        )
+    return task
+
+
+def _objects(task: Task, settings: EvaluateSettings, used: ObjectsUsed) -> tuple[tuple[ObjectRef, ...], Path]:
+    """The run's test objects, or all of another folder that suit the task and were not trained on; and their folder.
+
+    Raises:
+        UsageError: none is left.
+    """
+    folder = Path(used.folder)
+    selection = settings if settings.objects is not None else settings.model_copy(update={"objects": folder})
+    catalogue, folder = objects_for(task, selection, folder, per_category=0, seed=0)
+    refs = {entry.ref for entry in catalogue.usable}
+    if settings.objects is None:
+        refs &= set(used.test)
+    else:
+        # By content: the same object may lie in two folders, under two names.
+        trained = {ref.content_hash for ref in (*used.train, *used.validation)}
+        refs = {ref for ref in refs if ref.content_hash not in trained}
+    if not refs:
+        raise UsageError(f"{folder}: no object suits task '{task.name}' and was not trained on; name other objects")
+    return tuple(sorted(refs, key=lambda ref: ref.id)), folder
+
+
+def _possible_methods(policy: Policy) -> tuple[MethodName, ...]:
+    """The methods whose networks are trained."""
+    return tuple(name for name, method in METHODS.items() if policy.trained.issuperset(method.modules))
+
+
+def _name(setting: Setting, folder: Path, version: int) -> str:
+    """A name that other settings do not share, and people can tell apart."""
+    digest = hashlib.sha256(f"{version} {setting.model_dump_json()}".encode()).hexdigest()
+    return f"{setting.task}-{folder.name or 'objects'}-v{version}-{digest[:8]}"

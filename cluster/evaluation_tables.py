@@ -1,0 +1,102 @@
+"""The table of an evaluation as files: results.json for programs, table.csv for spreadsheets, table.md for people.
+
+They hold nothing of when, where and by how many workers they were made, so that an evaluation that was killed and run
+again leaves the same bytes.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from shared.files import write_atomically
+
+RESULTS_FILE, CSV_FILE, MARKDOWN_FILE = "results.json", "table.csv", "table.md"
+
+_SHOWN = {
+    "method": "method",
+    "budget": "tries",
+    "f_score": "F-score",
+    "gap_closed": "gap closed",
+    "sample_success": "sample-success",
+    "trials": "trials",
+    "best_f": "best F",
+    "bce": "BCE",
+    "auc": "AUC",
+    "mean_tries": "tries made",
+}
+"""Columns that people see, and what they call them."""
+_PERCENT = frozenset({"f_score", "gap_closed", "sample_success", "best_f"})
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """What came of an evaluation.
+
+    Attributes:
+        task: what was evaluated.
+        seed: of the evaluation.
+        objects: how many it drew from.
+        rollouts: how many trials in all; each fills the interactions anew for every method.
+        policy_version: of the policy that was evaluated.
+        store_digest: of the interactions that the figures are of.
+        rows: a row for each method and budget: the fields of `learner.evaluation.EvaluationRow` ("best_f" for short),
+            and "gap_closed", the share of the gap in F-score between Where2Act and the oracle; None for no figure.
+    """
+
+    task: str
+    seed: int
+    objects: int
+    rollouts: int
+    policy_version: int
+    store_digest: str
+    rows: tuple[Mapping[str, Any], ...]
+
+
+def write_tables(out: Path, table: Table) -> None:
+    """Write the three files; results.json comes last, so that where it is, all are."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomically(out / CSV_FILE, as_csv(table).encode())
+    write_atomically(out / MARKDOWN_FILE, as_markdown(table).encode())
+    write_atomically(out / RESULTS_FILE, json.dumps(asdict(table), indent=1, allow_nan=False).encode())
+
+
+def as_csv(table: Table) -> str:
+    """A line for each row, all columns, full precision; empty where there is no figure."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(table.rows[0]) if table.rows else [], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table.rows)
+    return text.getvalue()
+
+
+def as_markdown(table: Table) -> str:
+    """The table as the paper has it, with 95% intervals; percent where the paper has percent."""
+    base_rate = next((row["base_rate"] for row in table.rows), None)
+    shown = "none" if base_rate is None else f"{100 * base_rate:.1f}%"
+    lines = [
+        f"# {table.task}",
+        "",
+        f"{table.rollouts} trials on {table.objects} test objects, seed {table.seed}, policy {table.policy_version}. "
+        f"F-score at threshold 0.5 on random interactions, of which {shown} succeed. In brackets: 95% bootstrap "
+        "intervals over objects. Gap closed: of that in F-score between Where2Act and the oracle, which is told the "
+        f"hidden facts. Digest of the interactions: `{table.store_digest[:16]}`.",
+        "",
+        "| " + " | ".join(_SHOWN.values()) + " |",
+        "| --- |" + " ---: |" * (len(_SHOWN) - 1),
+    ]
+    lines += ["| " + " | ".join(_cell(row, name) for name in _SHOWN) + " |" for row in table.rows]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(row: Mapping[str, Any], name: str) -> str:
+    value = row[name]
+    if value is None:
+        return "-"
+    if name in _PERCENT:
+        low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+        return f"{100 * value:.1f}" + ("" if low is None or high is None else f" [{100 * low:.1f}, {100 * high:.1f}]")
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
