@@ -51,7 +51,7 @@ class Failure:
 
 
 class Blame:
-    """Counts the failures of one plan's jobs.
+    """Counts the failures of jobs.
 
     Args:
         workers: how many may be lost at the same time through no fault of a job.
@@ -61,11 +61,16 @@ class Blame:
         self._counts: Counter[tuple[Job, int | None, bool]] = Counter()
         self._idle_losses = 0
         self._most_idle_losses = MAX_LOSSES * workers
-        self._quarantined: dict[int, str] = {}
+        self._quarantined: dict[tuple[str, int], str] = {}
+        """By plan and rollout."""
 
     def quarantined(self, job: Job) -> dict[int, str]:
         """Rollouts of the job that are not to be executed any more, and why."""
-        return {rollout: why for rollout, why in self._quarantined.items() if job.start <= rollout < job.stop}
+        return {
+            rollout: why
+            for (plan_key, rollout), why in self._quarantined.items()
+            if plan_key == job.plan_key and job.start <= rollout < job.stop
+        }
 
     def acquit(self) -> None:
         """Take note that a job was done, so workers can live."""
@@ -82,7 +87,7 @@ class Blame:
         if failure.rollout is None:
             self._charge_no_rollout(job, failure, count)
         elif count >= (MAX_FAULTS if failure.fault else MAX_LOSSES):
-            self._quarantined[failure.rollout] = f"{failure.reason} ({count} times)"
+            self._quarantined[job.plan_key, failure.rollout] = f"{failure.reason} ({count} times)"
             logger.warning("rollout %d is quarantined: %s, %d times", failure.rollout, failure.reason, count)
             return
         what = "before its rollouts or after them" if failure.rollout is None else f"in rollout {failure.rollout}"

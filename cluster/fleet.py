@@ -1,7 +1,7 @@
 """Fleets: whoever executes the jobs of a plan. The serial one here, the Ray one in `cluster.ray_fleet`.
 
     fleet.load_policy(1, files)                    # once a version
-    fleet.run(plan, jobs, on_receipt=print)        # any number of times, on the same live workers
+    fleet.run(orders, on_receipt=print)            # any number of times, on the same live workers
     fleet.close()
 
 Jobs are idempotent by their shard: a worker that finds its shard committed does nothing. So a job may be submitted
@@ -9,17 +9,22 @@ again after any failure, and at-least-once delivery is enough.
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from cluster.blame import Blame, Failure, describe
+from cluster.orders import Order, Orders
 from collector.guard import UnderWay
 from shared.errors import AdaAffordError
 from shared.plan import Job, Plan
 
 if TYPE_CHECKING:
     from collector.worker import Receipt
+
+WAIT_S = 0.5
+"""How often a fleet that has nothing to do asks for orders."""
 
 logger = logging.getLogger(__name__)
 
@@ -55,15 +60,18 @@ class Fleet(Protocol):
 
     workers: int
     """How many work at the same time."""
+    restarts: int
+    """How many workers were replaced so far."""
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """Hand the weights of policy `version` to every worker, present and future."""
         ...
 
-    def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[["Receipt"], None]) -> None:
-        """Execute `jobs`, in any order, and report each once.
+    def run(self, orders: Orders, on_receipt: Callable[["Receipt"], None]) -> None:
+        """Execute `orders` until they have ended, in any order, and report each once.
 
-        A rollout that fails again and again is given up and recorded as quarantined; see `cluster.blame`.
+        They are taken no earlier than somebody is free for them, and asked for again where there is none yet. A rollout
+        that fails again and again is given up and recorded as quarantined; see `cluster.blame`.
 
         Raises:
             JobError: a job failed again and again, and no rollout of it was to blame.
@@ -86,6 +94,7 @@ class SerialFleet:
     workers = 1
 
     def __init__(self, make_worker: WorkerFactory) -> None:
+        self.restarts = 0
         self._make_worker = make_worker
         self._worker: Worker | None = None
         self._policies: dict[int, Mapping[str, bytes]] = {}
@@ -96,18 +105,23 @@ class SerialFleet:
         if self._worker is not None:
             self._worker.load_policy(version, files)
 
-    def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[["Receipt"], None]) -> None:
+    def run(self, orders: Orders, on_receipt: Callable[["Receipt"], None]) -> None:
         """See `Fleet.run`."""
         blame = Blame()
-        for job in jobs:
-            on_receipt(self._run_stubbornly(plan, job, blame))
+        while not orders.ended:
+            order = orders.take()
+            if order is None:
+                time.sleep(WAIT_S)
+            else:
+                on_receipt(self._run_stubbornly(order, blame))
 
     def close(self) -> None:
         """See `Fleet.close`."""
         self._worker = None
 
-    def _run_stubbornly(self, plan: Plan, job: Job, blame: Blame) -> "Receipt":
-        """Try `job`, with a fresh worker after each failure, until it is done or no rollout is to blame."""
+    def _run_stubbornly(self, order: Order, blame: Blame) -> "Receipt":
+        """Try a job, with a fresh worker after each failure, until it is done or no rollout is to blame."""
+        plan, job = order.plan, order.job
         while True:
             rollouts: list[int | None] = [None]
             try:
@@ -117,6 +131,7 @@ class SerialFleet:
             except Exception as error:
                 logger.info("job %s failed", job.shard_id, exc_info=True)
                 self._worker = None
+                self.restarts += 1
                 blame.charge(job, Failure(describe(error), rollouts[-1], fault=True))
 
     def _live_worker(self) -> Worker:

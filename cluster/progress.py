@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
     from collector.worker import Receipt
 
 LINE_EVERY_S = 5.0
+RECENT_S = 30.0
+"""What a rate counts as recent."""
+MAX_RECENT = 1024
+"""Receipts that are remembered for it."""
 
 
 @dataclass(slots=True)
@@ -70,10 +75,12 @@ class CollectionProgress:
         self._title, self._done, self._total, self._leaves, self._clock = title, done, total, leaves, clock
         self._begun = self._last_line = clock()
         self._bar: Progress | None = None
+        self._recent: deque[tuple[float, int]] = deque(maxlen=MAX_RECENT)
+        """When receipts came, and of how many interactions."""
 
     def __enter__(self) -> "CollectionProgress":
         left = self._total - self._done
-        self._say(f"{self._title}: {self._done} of {self._total} rollouts are there, {left} left; into {self._leaves}")
+        self.say(f"{self._title}: {self._done} of {self._total} rollouts are there, {left} left; into {self._leaves}")
         self._begun = self._last_line = self._clock()
         if self._console.is_terminal and left > 0:
             columns: list[ProgressColumn] = [SpinnerColumn(), TextColumn("{task.description}"), BarColumn()]
@@ -88,21 +95,31 @@ class CollectionProgress:
         if self._bar is not None:
             self._bar.stop()
         if self.tally.rollouts:
-            self._say(f"{self._title}: {self.describe()}")
+            self.say(f"{self._title}: {self.describe()}")
 
     def __call__(self, receipt: "Receipt") -> None:
         """Take in one receipt."""
         self.tally.add(receipt)
+        self._recent.append((self._clock(), receipt.interactions))
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=self._done + self.tally.rollouts)
         elif self._done + self.tally.rollouts < self._total and self._clock() - self._last_line >= LINE_EVERY_S:
             self._last_line = self._clock()
-            self._say(f"{self._title}: {self.describe()}")
+            self.say(f"{self._title}: {self.describe()}")
 
     @property
     def elapsed_s(self) -> float:
         """Since work began in this attempt."""
         return max(self._clock() - self._begun, 1e-9)
+
+    @property
+    def recent_per_s(self) -> float:
+        """Interactions a second of late."""
+        now = self._clock()
+        # A copy, since another thread may ask while receipts come in.
+        recent = [(moment, count) for moment, count in self._recent.copy() if now - moment < RECENT_S]
+        since = self._recent[0][0] if len(self._recent) == MAX_RECENT else now - RECENT_S
+        return sum(count for _, count in recent) / max(now - max(self._begun, since), 1e-9)
 
     def describe(self) -> str:
         """Done and left, speed, success rate and time left, in one line."""
@@ -116,7 +133,8 @@ class CollectionProgress:
             text += f", {_minutes(left_s)} left"
         return text
 
-    def _say(self, line: str) -> None:
+    def say(self, line: str) -> None:
+        """Print a line."""
         self._console.print(line, soft_wrap=True, markup=False)
 
 

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +11,12 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from cluster.blame import Blame, Failure, describe
-from cluster.fleet import WorkerFactory
+from cluster.fleet import WAIT_S, WorkerFactory
+from cluster.orders import Order, Orders
 from collector.actor import WorkerActor
 from collector.guard import Limits
 from shared.errors import AdaAffordError
 from shared.files import end_if_here
-from shared.plan import Job, Plan
 from shared.underway import Crumb, Underway
 
 if TYPE_CHECKING:
@@ -29,6 +29,8 @@ START_LIMIT_S = 120.0
 GRACE_S = 5.0
 """What an actor's own watchdog, which leaves a traceback, has in advance of the driver, which cannot."""
 LOST = "its process was lost without a word: killed from outside, or for want of memory"
+KEPT_POLICIES = 3
+"""Versions that the object store holds; older ones were replaced, and only jobs that failed may want them again."""
 POLL_S = 1.0
 """How often the driver looks for hung actors, however many receipts come."""
 
@@ -44,7 +46,7 @@ class _Seat:
     """What becomes ready when the actor's process is up; None from then on."""
     process: str = ""
     """By which name its breadcrumbs go; "" until it is up."""
-    pending: deque[tuple[Any, Job]] = field(default_factory=deque)
+    pending: deque[tuple[Any, Order]] = field(default_factory=deque)
     busy_since: float = 0.0
     """When the actor was started, or the oldest pending job came to the head; `time.monotonic`."""
     seen: tuple[Crumb | None, float] | None = None
@@ -86,6 +88,7 @@ class RayFleet:
             limits: what a rollout may take; an actor that goes beyond is ended.
         """
         self.workers = workers
+        self.restarts = 0
         self._make_worker = make_worker
         self._underway = underway
         self._limits = limits
@@ -97,17 +100,22 @@ class RayFleet:
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """See `Fleet.load_policy`: one `ray.put`; actors pull it when a plan first needs it."""
         if version not in self._policies:
+            while len(self._policies) >= KEPT_POLICIES:
+                self._policies.pop(next(iter(self._policies)))
             self._policies[version] = ray.put(dict(files))
 
-    def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[["Receipt"], None]) -> None:
+    def run(self, orders: Orders, on_receipt: Callable[["Receipt"], None]) -> None:
         """See `Fleet.run`."""
-        waiting = deque(jobs)
+        waiting: deque[Order] = deque()
         blame = Blame(self.workers)
         try:
-            while waiting or any(seat.pending for seat in self._seats):
-                self._hand_out(plan, waiting, blame)
+            while waiting or not orders.ended or any(seat.pending for seat in self._seats):
+                self._hand_out(orders, waiting, blame)
                 # A seat whose actor is still on its way has nothing else that could be ready.
                 refs = [seat.arrival or seat.pending[0][0] for seat in self._seats if seat.pending]
+                if not refs:
+                    time.sleep(WAIT_S)
+                    continue
                 ready, _ = ray.wait(refs, num_returns=1, timeout=self._poll_s)
                 if ready:
                     self._take_in(ready[0], waiting, blame, on_receipt)
@@ -124,27 +132,39 @@ class RayFleet:
         for seat in self._seats:
             self._dismiss(seat)
 
-    def _hand_out(self, plan: Plan, waiting: deque[Job], blame: Blame) -> None:
-        """Give each actor up to `IN_FLIGHT` jobs; no actor gets a second one while another has none."""
-        policy = self._policies.get(plan.policy_version)
-        box = [] if policy is None else [policy]
+    def _hand_out(self, orders: Orders, waiting: deque[Order], blame: Blame) -> None:
+        """Give each actor up to `IN_FLIGHT` jobs; no actor gets a second one while another has none.
+
+        Args:
+            orders: where new ones come from.
+            waiting: those that failed, which go first.
+            blame: knows what is not to be executed any more.
+        """
         for seat in self._seats:
             if seat.retiring and not seat.pending:
                 self._dismiss(seat)
+                self.restarts += 1
         for depth in range(IN_FLIGHT):
             for seat in self._seats:
-                if not waiting:
-                    return
                 if len(seat.pending) == depth and not seat.retiring:
-                    if seat.actor is None:
-                        self._start(seat)
-                    if not seat.pending:
-                        seat.busy_since = time.monotonic()
-                    job = waiting.popleft()
-                    ref = seat.actor.run.remote(plan, job, box, blame.quarantined(job))
-                    seat.pending.append((ref, job))
+                    order = waiting.popleft() if waiting else orders.take()
+                    if order is None:
+                        return
+                    self._give(seat, order, blame)
 
-    def _take_in(self, ref: Any, waiting: deque[Job], blame: Blame, on_receipt: Callable[["Receipt"], None]) -> None:
+    def _give(self, seat: _Seat, order: Order, blame: Blame) -> None:
+        """Submit an order to the seat's actor, which is started if there is none."""
+        if seat.actor is None:
+            self._start(seat)
+        if not seat.pending:
+            seat.busy_since = time.monotonic()
+        # Of a version that is no longer kept, the worker reads the weights in the store.
+        policy = self._policies.get(order.plan.policy_version)
+        box = [] if policy is None else [policy]
+        ref = seat.actor.run.remote(order.plan, order.job, box, blame.quarantined(order.job))
+        seat.pending.append((ref, order))
+
+    def _take_in(self, ref: Any, waiting: deque[Order], blame: Blame, on_receipt: Callable[["Receipt"], None]) -> None:
         """Report the receipt behind `ref`, or see to the failure that it stands for."""
         seat = next(seat for seat in self._seats if seat.pending and ref in (seat.arrival, seat.pending[0][0]))
         try:
@@ -166,7 +186,7 @@ class RayFleet:
         self._retire_if_grown(seat, message)
         on_receipt(message)
 
-    def _replace_hung(self, waiting: deque[Job], blame: Blame) -> None:
+    def _replace_hung(self, waiting: deque[Order], blame: Blame) -> None:
         """Replace actors that hang so thoroughly that not even their own watchdog ended them.
 
         A rollout is over its limit when the driver has seen its breadcrumb unchanged for so long by its own clock:
@@ -199,12 +219,14 @@ class RayFleet:
             logger.warning("a worker has grown by %.0f MB and is replaced", grown_mb)
             seat.retiring = True
 
-    def _fail(self, seat: _Seat, waiting: deque[Job], blame: Blame, reason: str, *, fault: bool) -> None:
+    def _fail(self, seat: _Seat, waiting: deque[Order], blame: Blame, reason: str, *, fault: bool) -> None:
         """Replace the seat's actor and put its jobs back in front; only what was under way is to blame."""
-        jobs = [job for _, job in seat.pending]
+        orders = [order for _, order in seat.pending]
+        jobs = [order.job for order in orders]
         crumb = self._underway.crumb_of(seat.process)
         self._dismiss(seat)
-        waiting.extendleft(reversed(jobs))
+        self.restarts += 1
+        waiting.extendleft(reversed(orders))
         job = next((job for job in jobs if crumb is not None and crumb.shard_id == job.shard_id), jobs[0])
         known = crumb is not None and crumb.shard_id == job.shard_id
         blame.charge(job, Failure(reason, crumb.rollout if known and crumb is not None else None, fault))

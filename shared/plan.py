@@ -4,6 +4,7 @@ A *setting* fixes everything that makes rows comparable; a store holds one. A *p
 range of a plan's rollouts and makes one *shard*. Nothing here knows who does the work, or when.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -85,22 +86,26 @@ class Job:
         return f"{self.plan_key}-{self.start:08d}-{self.stop:08d}"
 
 
+def missing_ranges(rollouts: int, done: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+    """What of [0, `rollouts`) no range in `done` covers, as half-open ranges in order; those of `done` may overlap."""
+    gaps, start = [], 0
+    for low, high in sorted(done):
+        gaps.append((start, min(low, rollouts)))
+        start = max(start, high)
+    return [(begin, stop) for begin, stop in [*gaps, (start, rollouts)] if begin < stop]
+
+
 def missing_jobs(plan_key: str, rollouts: int, done: list[tuple[int, int]], per_shard: int) -> list[Job]:
     """Jobs for the rollouts in [0, `rollouts`) that no committed range in `done` covers.
 
     Args:
         plan_key: the plan.
         rollouts: how many are wanted in all.
-        done: committed half-open ranges; they do not overlap.
+        done: committed half-open ranges.
         per_shard: the most rollouts that one job may hold.
     """
-    gaps, start = [], 0
-    for low, high in sorted(done):
-        gaps.append((start, min(low, rollouts)))
-        start = max(start, high)
-    gaps.append((start, rollouts))
     return [
         Job(plan_key, first, min(first + per_shard, stop))
-        for begin, stop in gaps
+        for begin, stop in missing_ranges(rollouts, done)
         for first in range(begin, stop, per_shard)
     ]

@@ -13,6 +13,7 @@ import pytest
 
 from cluster.blame import MAX_FAULTS, MAX_LOSSES
 from cluster.fleet import Fleet, WorkerFactory
+from cluster.orders import Listed
 from cluster.session import fleets
 from collector.guard import Limits
 from shared.configuration import CollectionConfig
@@ -62,7 +63,7 @@ def jobs(count: int, key: str = "random-v0") -> list[Job]:
 
 def run(fleet: Fleet, count: int) -> list[str]:
     receipts: list[FakeReceipt] = []
-    fleet.run(plan(), jobs(count), receipts.append)
+    fleet.run(Listed(plan(), jobs(count)), receipts.append)
     return sorted(receipt.shard_id for receipt in receipts)
 
 
@@ -112,7 +113,7 @@ def test_weights_reach_the_live_workers_once_a_version(fleet: Fleet, tmp_path: P
     before = {line.split()[1] for line in (tmp_path / "begun").read_text().splitlines()}
     for version in (1, 2):
         fleet.load_policy(version, {"weights.safetensors": b"weights %d" % version})
-        fleet.run(plan("aip", version), jobs(8, f"aip-v{version}"), lambda receipt: None)
+        fleet.run(Listed(plan("aip", version), jobs(8, f"aip-v{version}")), lambda receipt: None)
         pulls = (tmp_path / f"pulled-{version}").read_text().split()
         assert len(pulls) == len(set(pulls)) <= fleet.workers
     assert {line.split()[1] for line in (tmp_path / "begun").read_text().splitlines()} == before
@@ -122,7 +123,7 @@ def test_a_replaced_actor_pulls_the_weights_itself(ray_fleet: Fleet, tmp_path: P
     ray_fleet.load_policy(1, {"weights.safetensors": b"weights 1"})
     (tmp_path / "die-2").write_text("1")
     done: list[FakeReceipt] = []
-    ray_fleet.run(plan("aip", 1), jobs(6, "aip-v1"), done.append)
+    ray_fleet.run(Listed(plan("aip", 1), jobs(6, "aip-v1")), done.append)
     assert len(done) == 6
 
 
@@ -130,7 +131,7 @@ def test_a_rollout_that_crashes_costs_itself_alone(ray_fleet: Fleet, tmp_path: P
     (tmp_path / "crash-2").write_text("99")
     wide = missing_jobs("random-v0", 8, [], 4)
     done: list[FakeReceipt] = []
-    ray_fleet.run(plan(), wide, done.append)
+    ray_fleet.run(Listed(plan(), wide), done.append)
     assert sorted(receipt.shard_id for receipt in done) == [job.shard_id for job in wide]
     assert sum(receipt.quarantined for receipt in done) == 1
     assert begun(tmp_path, wide[0]) == 4
@@ -211,7 +212,7 @@ def test_an_actor_holds_at_most_two_jobs(ray_fleet: Fleet, tmp_path: Path) -> No
         seats = ray_fleet._seats  # type: ignore[attr-defined]
         most = max(most, *(len(seat.pending) for seat in seats))
 
-    ray_fleet.run(plan(), jobs(12), watch)
+    ray_fleet.run(Listed(plan(), jobs(12)), watch)
     assert most <= 2
 
 
@@ -221,7 +222,7 @@ def test_an_interrupt_leaves_no_actor_at_work(ray_fleet: Fleet, tmp_path: Path) 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            ray_fleet.run(plan(), jobs(4), lambda receipt: os.kill(os.getpid(), signal.SIGINT))
+            ray_fleet.run(Listed(plan(), jobs(4)), lambda receipt: os.kill(os.getpid(), signal.SIGINT))
     finally:
         signal.signal(signal.SIGINT, before)
     assert not any(seat.pending for seat in ray_fleet._seats)  # type: ignore[attr-defined]

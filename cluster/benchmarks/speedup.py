@@ -11,10 +11,11 @@ from typing import Any
 from cluster.benchmarks.collecting import ROLLOUTS_PER_SHARD
 from cluster.benchmarks.progress import Advance
 from cluster.fleet import make_worker
+from cluster.orders import Series
 from cluster.ray_fleet import RayFleet
 from cluster.session import ray_session
 from collector.guard import Limits
-from shared.plan import Job, Plan
+from shared.plan import Plan
 from shared.store import Store
 
 
@@ -47,7 +48,8 @@ def speedup(plan: Plan, folder: Path, rollouts: int, repeats: int, workers: int,
         for turn in range(repeats + 1):
             for fleet, wall in zip(fleets, walls, strict=True):
                 begun = time.perf_counter()
-                fleet.run(plan, _jobs(plan, turn * rollouts, (turn + 1) * rollouts), lambda _: None)
+                orders = Series(lambda: plan, [(turn * rollouts, (turn + 1) * rollouts)], ROLLOUTS_PER_SHARD)
+                fleet.run(orders, lambda _: None)
                 wall.append(time.perf_counter() - begun)
                 advance()
         alone, together = (wall[1:] for wall in walls)
@@ -58,9 +60,3 @@ def speedup(plan: Plan, folder: Path, rollouts: int, repeats: int, workers: int,
             "workers_wall_seconds": together,
             "same_digest": stores[0].digest() == stores[1].digest(),
         }
-
-
-def _jobs(plan: Plan, start: int, stop: int) -> list[Job]:
-    return [
-        Job(plan.key, first, min(first + ROLLOUTS_PER_SHARD, stop)) for first in range(start, stop, ROLLOUTS_PER_SHARD)
-    ]

@@ -21,7 +21,11 @@ class CollectSettings(ObjectSelection):
     task: str = "push"
     """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
     rollouts: int = Field(100, ge=1)
-    """How many the store shall hold of this plan, those of earlier attempts included."""
+    """How many the store shall hold of this plan, those of earlier attempts included; with --policy latest, of this
+    proposer with any policy."""
+    per_version: int | None = Field(None, ge=1)
+    """With --policy latest: rollouts that one version proposes at the most; then the next one is waited for (rounds).
+    Without it, each version proposes until there is a newer one (continuous collection)."""
     per_shard: int = Field(4, ge=1, le=4096)
     """Rollouts a shard."""
     seed: int = Field(1, ge=0, lt=2**63)
@@ -49,8 +53,9 @@ class CollectCommand:
     """Folder or s3:// URL of the store: new, or of the same setting."""
     proposer: Literal["random", "aip"] = "random"
     """Who chooses the interactions."""
-    policy: int = 0
-    """Version of the policy in the store that the proposer uses; "aip" needs one."""
+    policy: int | Literal["latest"] = 0
+    """Version of the policy in the store that the proposer uses; "aip" needs one. "latest": always the newest that is
+    published, also by a learner that is at work at the same time (`adaafford learn --follow`)."""
     config: Path | None = None
     """A TOML file of settings; flags are laid over it."""
 
@@ -62,14 +67,16 @@ def main(args: list[str]) -> int:
     defaults = CollectCommand(layered(CollectSettings, None, config), tyro.MISSING, config=config)
     command = parse_flags(CollectCommand, args, "collect", defaults)
     task_named(command.settings.task)
-    if (command.proposer == "aip") != (command.policy > 0):
-        raise UsageError("the proposer 'aip' needs --policy VERSION (1 or more), and 'random' takes none")
+    if (command.proposer == "aip") != (command.policy == "latest" or command.policy > 0):
+        raise UsageError("the proposer 'aip' needs --policy VERSION (1 or more, or latest), and 'random' takes none")
+    if command.settings.per_version is not None and command.policy != "latest":
+        raise UsageError("--per-version is about the versions of --policy latest; without that, give --rollouts alone")
     _collect(command)
     return 0
 
 
 def _collect(command: CollectCommand) -> None:
-    from cluster.collection import collect
+    from cluster.collection import Newest, collect
     from cluster.fleet import make_worker
     from cluster.objects import objects_for
     from cluster.session import fleets
@@ -93,7 +100,11 @@ def _collect(command: CollectCommand) -> None:
         collection=task_named(chosen.task).resolve(chosen.collection),
     )
     store = Store.create(where, setting)
-    plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
+    plan: Plan | Newest
+    if command.policy == "latest":
+        plan = Newest(command.proposer, chosen.per_version)
+    else:
+        plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
     limits = Limits(chosen.rollout_limit_s, chosen.memory_limit_mb)
     with store.only_driver(), fleets(chosen.workers, limits, chosen.ray_address) as make_fleet:
         open_fleet = partial(make_fleet, partial(make_worker, where, folder), store.underway)

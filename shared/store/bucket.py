@@ -133,6 +133,17 @@ class BucketPlace:
             return False
         return True
 
+    def replace(self, key: str, data: bytes) -> None:
+        """See `Place.replace`."""
+        self._ask(lambda: self._client.put(key, data, use_multipart=False), key)
+
+    def remove(self, key: str) -> None:
+        """See `Place.remove`."""
+        try:
+            self._ask(lambda: self._client.delete(key), key, missing_is_error=False)
+        except FileNotFoundError:
+            return
+
     def publish(self, publication: Publication) -> bool:
         """See `Place.publish`."""
         folder, mark = publication.folder, f"{publication.folder}/{publication.mark}"

@@ -14,6 +14,7 @@ from shared.files import (
     remove_tree,
     sync_folder,
     temporary_name,
+    write_atomically,
     write_durably,
 )
 from shared.store.layout import LOCK_PREFIX
@@ -77,6 +78,16 @@ class DiskPlace:
             return False
         path.parent.mkdir(parents=True, exist_ok=True)
         return create_exclusively(path, data)
+
+    def replace(self, key: str, data: bytes) -> None:
+        """See `Place.replace`."""
+        path = self._at(key)
+        path.parent.mkdir(exist_ok=True)
+        write_atomically(path, data)
+
+    def remove(self, key: str) -> None:
+        """See `Place.remove`."""
+        self._at(key).unlink(missing_ok=True)
 
     def publish(self, publication: Publication) -> bool:
         """See `Place.publish`."""

@@ -39,7 +39,11 @@ class Publication:
 
 
 class Place(Protocol):
-    """Files by key. Nothing that is there is ever overwritten, and nothing is deleted but remnants of dead writers."""
+    """Files by key.
+
+    No data that are there are ever overwritten, and nothing is deleted but remnants of dead writers; what tells of the
+    moment (`replace`, `remove`) lies in a folder of its own.
+    """
 
     where: str
     """What people call it: a folder or a URL."""
@@ -80,6 +84,19 @@ class Place(Protocol):
 
     def create(self, key: str, data: bytes) -> bool:
         """Put a file there, wholly or not at all, unless there is one; returns whether this call made it."""
+        ...
+
+    def replace(self, key: str, data: bytes) -> None:
+        """Put a file there, wholly or not at all, over what was there; for what tells of the moment, never for data.
+
+        Raises:
+            StoreError: the place is out of reach.
+            OSError: the file cannot be written.
+        """
+        ...
+
+    def remove(self, key: str) -> None:
+        """Remove such a file; it is no error if there is none."""
         ...
 
     def publish(self, publication: Publication) -> bool:

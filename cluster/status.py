@@ -1,0 +1,154 @@
+"""How a collection stands: what its driver writes down every few seconds, and who else reads it.
+
+    STORE/underway/driver.json     replaced as a whole; about the moment, so no data and never in a digest
+
+The driver alone writes it, so it is read without asking the driver, on any machine that reaches the store, and also
+after the driver has ended.
+"""
+
+import logging
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Literal
+
+from pydantic import Field, ValidationError
+
+from shared.configuration import StrictModel
+from shared.errors import StoreError
+from shared.files import is_gone
+from shared.store.layout import UNDERWAY_FOLDER
+from shared.store.place import Place
+
+BEAT_S = 2.0
+"""How often the driver writes how it stands; one small file, whatever is collected."""
+SILENT_S = 30.0
+"""A driver that has written nothing for so long is not at work; clocks of machines may differ by some seconds."""
+MAX_STATUS_BYTES = 1 << 16
+_KEY = f"{UNDERWAY_FOLDER}/driver.json"
+
+State = Literal["collecting", "waiting", "done", "stopped"]
+
+logger = logging.getLogger(__name__)
+
+
+class DriverStatus(StrictModel):
+    """How a collection stands."""
+
+    process: str = Field(max_length=200)
+    """The driver's, as `shared.files.process_name` has it."""
+    written: float = Field(ge=0)
+    """Seconds since 1970, by the driver's clock."""
+    state: State
+    """Waiting: all that the policies so far may propose is handed out."""
+    title: str = Field(max_length=100)
+    """What is collected: a plan, or a proposer that follows a learner."""
+    policy: int | None = Field(None, ge=0)
+    """The version in force; 0 is none, null that the first one is waited for."""
+    done: int = Field(ge=0)
+    """Rollouts that are there, earlier attempts included."""
+    total: int = Field(ge=0)
+    elapsed_s: float = Field(ge=0)
+    """Since work began in this attempt; what follows is of this attempt, too."""
+    rollouts: int = Field(ge=0)
+    interactions: int = Field(ge=0)
+    successes: int = Field(ge=0)
+    outcomes: dict[str, int]
+    quarantined: int = Field(ge=0)
+    recent_per_s: float = Field(ge=0)
+    """Interactions a second over the last half minute."""
+    workers: int = Field(ge=0)
+    restarts: int = Field(ge=0)
+    """Workers that were replaced."""
+
+    @property
+    def left(self) -> int:
+        """Rollouts to do."""
+        return max(self.total - self.done, 0)
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until all is done, at the pace so far; None if there is none to judge by."""
+        if self.state != "collecting" or not self.rollouts:
+            return None
+        return self.left * self.elapsed_s / self.rollouts
+
+    def is_alive(self, now: float) -> bool:
+        """Whether the driver is at work, as far as that can be told from here.
+
+        Args:
+            now: seconds since 1970.
+        """
+        ended = self.state in ("done", "stopped") or is_gone(self.process)
+        return not ended and now - self.written < SILENT_S
+
+
+def read_status(place: Place) -> DriverStatus | None:
+    """How the last collection into a store stands; None where none has said so, or what it said is damaged."""
+    try:
+        if not place.exists(_KEY):
+            return None
+        return DriverStatus.model_validate_json(place.read(_KEY, MAX_STATUS_BYTES))
+    except (StoreError, ValidationError):
+        return None
+
+
+class StatusKeeper:
+    """Writes how a collection stands, in the background; use as a context.
+
+    Args:
+        place: of the store.
+        stand: tells how it stands, given the state.
+        is_waiting: whether all that may be done now is handed out.
+        say: is told when that begins.
+        beat_s: how often.
+    """
+
+    def __init__(
+        self,
+        place: Place,
+        stand: Callable[[State], DriverStatus],
+        is_waiting: Callable[[], bool],
+        say: Callable[[str], None],
+        beat_s: float = BEAT_S,
+    ) -> None:
+        self._place = place
+        self._stand = stand
+        self._is_waiting = is_waiting
+        self._say = say
+        self._beat_s = beat_s
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._repeat, name="status", daemon=True)
+
+    def __enter__(self) -> "StatusKeeper":
+        """Begin."""
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Write once more, how it ended."""
+        self._stop.set()
+        self._thread.join()
+        self._write("done" if kind is None else "stopped")
+
+    def _repeat(self) -> None:
+        before: State = "collecting"
+        while True:
+            state: State = "waiting" if self._is_waiting() else "collecting"
+            if state == "waiting" != before:
+                self._say(
+                    f"waiting for a newer policy in {self._place.where}; `adaafford learn --follow` publishes them"
+                )
+            before = state
+            self._write(state)
+            if self._stop.wait(self._beat_s):
+                return
+
+    def _write(self, state: State) -> None:
+        try:
+            self._place.replace(_KEY, self._stand(state).model_dump_json(indent=1).encode())
+        except (StoreError, OSError) as error:
+            # Nothing depends on it; where the store itself is out of reach, the workers say so.
+            logger.info("the status cannot be written (%s)", error)
