@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-import fpsample
 import numpy as np
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
@@ -11,12 +10,11 @@ from numpy.typing import NDArray
 
 from collector.articulation import ArticulatedObject
 from shared.configuration import CameraConfig
-from shared.observation import round_normals, round_points
+from shared.observation import furthest_first, round_normals, round_points
 from shared.vocabulary import Float, Observation
 
 NEAR, FAR = 0.1, 100.0
 """Published clipping distances."""
-_FPS_TREE_HEIGHT = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,17 +137,10 @@ def observation_from(
         config: how many points to keep, and of how many candidates.
         rng: draws the candidates.
     """
-    count = len(image.pixels)
-    if count == 0:
+    if len(image.pixels) == 0:
         return None
-    chosen = np.arange(count)
-    if count > config.candidates:
-        chosen = rng.choice(count, config.candidates, replace=False)
-    elif count < config.points:  # A small object fills few pixels: every one is kept and some stand twice.
-        chosen = np.concatenate([chosen, rng.integers(count, size=config.points - count)])
-    points = image.points[chosen].astype(np.float32)
-    order = fpsample.bucket_fps_kdline_sampling(points, config.points, h=_FPS_TREE_HEIGHT, start_idx=0)
-    kept = chosen[order.astype(np.int64)]
+    # A small object fills few pixels: then every one is kept, and some stand twice.
+    kept = furthest_first(image.points, config.points, config.candidates, rng)
     bodies = image.bodies[kept]
     return Observation(
         points=round_points(image.points[kept]),

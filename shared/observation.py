@@ -1,15 +1,41 @@
-"""How a cloud is rounded for keeping, so that a proposer sees exactly what a learner will read back.
+"""What is kept of a cloud, and how it is rounded, so that a proposer sees exactly what a learner will read back.
 
 Points are kept as float16 (about 0.5 mm at 1 unit), normals as three signed bytes of 1/127 (within half a degree).
 Shapes: N points; any leading shape will do.
 """
 
+import fpsample
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.vocabulary import Float, Float32
 
 NORMAL_STEPS = 127
+_FPS_TREE_HEIGHT = 5
+
+
+def furthest_first(points: Float | Float32, count: int, candidates: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Indices of the points that are kept of many, in furthest-point order, so that any prefix covers them all.
+
+    Args:
+        points: [M, 3], at least one.
+        count: how many to keep; of fewer points some stand twice.
+        candidates: furthest points are sought among so many that are drawn at random.
+        rng: draws them.
+
+    Returns:
+        [count].
+    """
+    chosen = np.arange(len(points))
+    if len(points) > candidates:
+        chosen = rng.choice(len(points), candidates, replace=False)
+    elif len(points) < count:
+        chosen = np.concatenate([chosen, rng.integers(len(points), size=count - len(points))])
+    order = fpsample.bucket_fps_kdline_sampling(
+        points[chosen].astype(np.float32), count, h=_FPS_TREE_HEIGHT, start_idx=0
+    )
+    kept: NDArray[np.int64] = chosen[order.astype(np.int64)]
+    return kept
 
 
 def round_points(points: Float | Float32) -> Float32:

@@ -110,9 +110,17 @@ class Policy:
                     f"this policy's {name} is not trained (trained: {known}); run `adaafford train {name}`"
                 )
 
-    def to_files(self) -> dict[str, bytes]:
-        """The policy as files: weights.safetensors and policy.json."""
-        weights = save({name: tensor.contiguous() for name, tensor in self.modules().state_dict().items()})
+    def to_files(self, half: bool = False) -> dict[str, bytes]:
+        """The policy as files: weights.safetensors and policy.json.
+
+        Args:
+            half: keep weights as float16, of half the size; scores then agree to about 1e-3.
+
+        Raises:
+            UsageError: a weight is too large for float16.
+        """
+        tensors = {name: tensor.contiguous() for name, tensor in self.modules().state_dict().items()}
+        weights = save(_halved(tensors) if half else tensors)
         document = PolicyDocument(
             task=self.task,
             network=self.config,
@@ -135,7 +143,7 @@ class Policy:
             raise StoreError(f"policy: {WEIGHTS_FILE} is missing or larger than {MAX_WEIGHTS_BYTES} bytes")
         if hashlib.sha256(weights).hexdigest() != document.weights_sha256:
             raise StoreError(f"policy: the SHA-256 of {WEIGHTS_FILE} is not that of {POLICY_FILE}; publish it again")
-        tensors = read_tensors(weights, WEIGHTS_FILE)
+        tensors = _widened(read_tensors(weights, WEIGHTS_FILE))
         # On the meta device nothing is allocated, so that absurd sizes cost nothing before they are refused.
         with torch.device("meta"):
             policy = cls(document.task, document.network, frozenset(document.trained))
@@ -176,6 +184,20 @@ def check_tensors(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor],
             raise StoreError(f"{source}: tensor '{name}' is {given}, needs {want.dtype} {tuple(want.shape)}")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise StoreError(f"{source}: tensor '{name}' holds numbers that are not finite; train again")
+
+
+def _halved(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Floating-point tensors as float16; counters stay what they are."""
+    halved = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
+    for name, tensor in halved.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise UsageError(f"weights '{name}' do not fit into half precision; export them in full precision")
+    return halved
+
+
+def _widened(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors that were kept in half precision as the networks want them."""
+    return {name: tensor.float() if tensor.dtype == torch.float16 else tensor for name, tensor in tensors.items()}
 
 
 def _parse_document(data: bytes | None) -> PolicyDocument:

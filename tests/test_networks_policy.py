@@ -111,3 +111,23 @@ def test_weights_of_another_network_are_refused(files: dict[str, bytes]) -> None
     changes = {"network": NetworkConfig().model_dump(mode="json")}
     with pytest.raises(StoreError, match=r"another network|needs torch\.float32"):
         Policy.from_files(resealed(files, files[WEIGHTS_FILE], **changes))
+
+
+def test_half_precision_is_half_the_size_and_says_nearly_the_same() -> None:
+    policy = Policy.untrained("push", TINY, seed=3).with_trained("prior")
+    whole, half = policy.to_files(), policy.to_files(half=True)
+    again = Policy.from_files(half)
+    assert len(half[WEIGHTS_FILE]) < 0.6 * len(whole[WEIGHTS_FILE])
+    assert (again.task, again.config, again.trained) == (policy.task, policy.config, policy.trained)
+    for name, tensor in again.modules().state_dict().items():
+        before = policy.modules().state_dict()[name]
+        assert tensor.dtype == before.dtype
+        torch.testing.assert_close(tensor, before, rtol=1e-3, atol=1e-6)
+    assert again.to_files(half=True) == half
+
+
+def test_weights_that_half_precision_cannot_hold_are_not_exported_in_it(files: dict[str, bytes]) -> None:
+    policy = Policy.from_files(files)
+    policy.aap.empty_latent[0] = 1e6
+    with pytest.raises(UsageError, match="do not fit into half precision"):
+        policy.to_files(half=True)
