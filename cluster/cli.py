@@ -22,6 +22,7 @@ COMMANDS = {
     "report": "print a run's results again",
     "collect": "collect interactions into a store, without any learning",
     "train": "prior, aap, aip or alternate: train from a store alone",
+    "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
     "store": "info, verify, digest, replay, repair, compact, merge or export: look after stores",
     "objects": "generate, check, preview or decompose: the objects",
     "bench": "fidelity, dynamics, collect, store, learner or adapt: measure how fast and how true each part is",
@@ -29,7 +30,7 @@ COMMANDS = {
 }
 """Subcommands, each a module of `cluster.commands` with `main(args) -> int`."""
 
-RESUMABLE = ("run", "resume", "collect", "train", "evaluate")
+RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate")
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells more\n\n" + "\n".join(
     f"  {name:<9}{text}" for name, text in COMMANDS.items()

@@ -1,17 +1,18 @@
-"""The alternation offline: prior, AAP, AIP, then AAP fine-tuned and AIP again, from a finished store until convergence.
+"""The alternation: prior, AAP, AIP, then AAP fine-tuned and AIP again, until that brings no more.
 
 RUN/ of an alternation
     prior/, aap-1/, aip-1/, aap-2/, ...   one folder a stage (see `learner.stages`), each resumable by itself
     alternation.json                      the rounds, which of them is the best, and why they ended; written last
 
-Where the store holds rounds that policies proposed, round V of training learns from what versions below V proposed, as
-a campaign would have had it (AdaAfford, Training Strategy); later rounds, from all rows.
+What each round learns from is up to `Rounds`: of a finished store (`Finished`), or of one that still grows
+(`learner.following`).
 """
 
 import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 from learner import sharing
 from learner.configuration import AlternationConfig, LearnerConfig
@@ -38,8 +39,52 @@ class Round:
     score: float
 
 
-def alternate(job: StageJob, config: LearnerConfig, hardware: Hardware | None = None) -> Policy:
-    """Train rounds until they bring no more, or go on with them after a kill; returns the policy of the best round.
+class Rounds(Protocol):
+    """What the rounds of an alternation learn from, and what becomes of their policies."""
+
+    at_least: int
+    """Rounds that it takes to have learnt from all that is there."""
+
+    def data(self, job: StageJob, number: int) -> StageJob:
+        """The job with what round `number`, from 1, learns from, the prior being 0; waits until there is enough."""
+        ...
+
+    def done(self, number: int, policy: Path) -> None:
+        """Take note that a round has left its policy in a folder."""
+        ...
+
+
+class Finished:
+    """The rounds of a store that grows no more.
+
+    Where it holds rounds that policies proposed, round V of training learns from what versions below V proposed, as a
+    campaign would have had it (AdaAfford, Training Strategy); later rounds, from all rows.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._newest = newest_policy(store)
+        self.at_least = self._newest + 1
+
+    def data(self, job: StageJob, number: int) -> StageJob:
+        """See `Rounds.data`."""
+        return replace(job, newest_policy=number - 1) if 1 <= number <= self._newest else job
+
+    def done(self, number: int, policy: Path) -> None:
+        """See `Rounds.done`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Best:
+    """The best round's policy, and the folder that it lies in."""
+
+    policy: Policy
+    folder: Path
+
+
+def alternate(
+    job: StageJob, config: LearnerConfig, hardware: Hardware | None = None, rounds: Rounds | None = None
+) -> Best:
+    """Train rounds until they bring no more, or go on with them after a kill; returns what the best of them made.
 
     A round counts if it lowers the best validation loss of AAP by more than `config.alternation.improvement` of it. The
     rounds end when `patience` of them in a row did not count and every round of the store has been learnt from.
@@ -49,25 +94,26 @@ def alternate(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
         StoreError: see `run_stage`.
     """
     hardware = hardware or Hardware()
-    newest = newest_policy(Store.open(job.store))
-    last = _run(job, config, hardware, "prior", "prior", job.init)
-    rounds: list[Round] = []
+    rounds = rounds or Finished(Store.open(job.store))
+    last = _run(rounds.data(job, 0), config, hardware, "prior", "prior", job.init)
+    trained: list[Round] = []
     policies: list[Policy] = []
-    while not converged([found.score for found in rounds], config.alternation, newest + 1):
-        number = len(rounds) + 1
-        seen = replace(job, newest_policy=number - 1) if number <= newest else job
+    while not converged([found.score for found in trained], config.alternation, rounds.at_least):
+        number = len(trained) + 1
+        seen = rounds.data(job, number)
         aap = _run(seen, config, hardware, "aap", f"aap-{number}", last[0])
         last = _run(seen, config, hardware, "aip", f"aip-{number}", aap[0])
         policies.append(last[1])
-        rounds.append(Round(number, best_score(aap[0])))
-    best = min(rounds, key=lambda found: found.score)
+        trained.append(Round(number, best_score(aap[0])))
+        rounds.done(number, last[0])
+    best = min(trained, key=lambda found: found.score)
     if sharing.rank() == 0:
-        told = {"rounds": [{"round": r.number, "score": r.score} for r in rounds], "best": best.number}
-        told["converged"] = len(rounds) < config.alternation.rounds
+        told = {"rounds": [{"round": r.number, "score": r.score} for r in trained], "best": best.number}
+        told["converged"] = len(trained) < config.alternation.rounds
         write_atomically(job.out / ALTERNATION_FILE, json.dumps(told, indent=1).encode())
         why = "converged" if told["converged"] else "no more rounds allowed"
-        print(f"{job.out}: {why} after {len(rounds)}; the best policy is {job.out / f'aip-{best.number}'}", flush=True)
-    return policies[best.number - 1]
+        print(f"{job.out}: {why} after {len(trained)}; the best policy is {job.out / f'aip-{best.number}'}", flush=True)
+    return Best(policies[best.number - 1], job.out / f"aip-{best.number}")
 
 
 def converged(scores: list[float], config: AlternationConfig, at_least: int) -> bool:

@@ -169,9 +169,7 @@ def split(dataset: Dataset, train: Collection[str] | None, validation: Collectio
     if leaked:
         raise UsageError(f"object '{leaked[0]}' is listed for training and for validation; list each object once")
     if validation is None:
-        # A rank, instead of a remainder of the hash, never comes out empty for few objects.
-        left = sorted(set(dataset.objects) - set(train or ()), key=lambda name: (zlib.crc32(name.encode()), name))
-        validation = left if train is not None else left[: max(1, len(left) // VALIDATION_SHARE)]
+        validation = set(dataset.objects) - set(train) if train is not None else kept_for_validation(dataset.objects)
     if train is None:
         train = set(dataset.objects) - set(validation)
     parts = Split(dataset.rollouts_of(train), dataset.rollouts_of(validation))
@@ -179,6 +177,13 @@ def split(dataset: Dataset, train: Collection[str] | None, validation: Collectio
         if not found:
             raise UsageError(f"no rollout of the store is of an object for {name}; collect or list more objects")
     return parts
+
+
+def kept_for_validation(objects: Iterable[str]) -> frozenset[str]:
+    """One object in five, by a hash of its id, and at least one."""
+    # A rank, instead of a remainder of the hash, never comes out empty for few objects.
+    ranked = sorted(set(objects), key=lambda name: (zlib.crc32(name.encode()), name))
+    return frozenset(ranked[: max(1, len(ranked) // VALIDATION_SHARE)])
 
 
 def without_later(dataset: Dataset, parts: Split, newest: int) -> Split:

@@ -36,6 +36,7 @@ from shared.policy import (
     Policy,
 )
 from shared.seeds import torch_seed
+from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
 DONE_FILE = "done.json"
@@ -65,6 +66,7 @@ class StageJob:
         init: folder with the policy to start from; None: random weights (the prior only).
         train_objects: ids of the objects to learn from (see `learner.data.split`).
         validation_objects: ids of the objects to judge by.
+        snapshot: learn from these rollouts alone; None: from all that the store holds.
         newest_policy: rollouts that later policies proposed are left out of what is learnt from; None: all are in.
     """
 
@@ -74,6 +76,7 @@ class StageJob:
     init: Path | None = None
     train_objects: Collection[str] | None = None
     validation_objects: Collection[str] | None = None
+    snapshot: Snapshot | None = None
     newest_policy: int | None = None
 
 
@@ -86,6 +89,8 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
         StoreError: the store, the policy or a checkpoint is damaged.
     """
     store = Store.open(job.store)
+    if job.snapshot is not None:
+        store = store.as_of(job.snapshot)
     policy = _initial_policy(job, store, config)
     fingerprint = _fingerprint(job, config, store, policy)
     done = (job.out / DONE_FILE).exists()

@@ -75,4 +75,7 @@ def _train(stage: str, command: TrainCommand) -> None:
         validation_objects=read_object_list(command.validation_objects),
     )
     with hardware(command.settings) as used:
-        (alternate if stage == "alternate" else run_stage)(job, command.settings, used)
+        if stage == "alternate":
+            alternate(job, command.settings, used)
+        else:
+            run_stage(job, command.settings, used)

@@ -44,6 +44,7 @@ from shared.store.observations import ObservationArrays
 from shared.store.place import Folder, Place, is_url, place_of
 from shared.store.provenance import software_versions
 from shared.store.sealed import seal, unseal
+from shared.store.snapshot import Snapshot
 from shared.store.tables import INTERACTION_SCHEMA, ROLLOUT_SCHEMA
 from shared.store.writer import commit_shard
 from shared.underway import Underway
@@ -61,6 +62,7 @@ class Store:
         self.place = place
         self.document = document
         self._recorded: dict[str, Plan] = {}
+        self._snapshot: Snapshot | None = None
 
     @property
     def where(self) -> str:
@@ -119,6 +121,12 @@ class Store:
             raise StoreError(f"{where}: is no store (it has no {STORE_FILE}); name an existing store")
         return cls(place, parse_store_document(place.read(STORE_FILE, MAX_DOCUMENT_BYTES), f"{where}/{STORE_FILE}"))
 
+    def as_of(self, snapshot: Snapshot) -> "Store":
+        """The store as it was when it held these rollouts, for whoever reads it while others add to it."""
+        store = Store(self.place, self.document)
+        store._snapshot = snapshot
+        return store
+
     def add_plan(self, plan: Plan) -> None:
         """Record a plan; recording it again changes nothing.
 
@@ -175,7 +183,8 @@ class Store:
 
     def parts(self, plan_key: str | None = None) -> list[Part]:
         """What counts of which shard, in order; raises as `committed` does."""
-        return parts_of(reader.read_manifests(reader.committed_shards(self.place, plan_key)))
+        parts = parts_of(reader.read_manifests(reader.committed_shards(self.place, plan_key)))
+        return parts if self._snapshot is None else self._snapshot.limit(parts)
 
     def tables_of(self, part: Part) -> tuple[Any, Any]:
         """The rollouts and the interactions of a shard that count, as tables.

@@ -1,0 +1,162 @@
+"""Learning beside collection: the alternation, whose rounds wait for new rollouts and publish what they made.
+
+RUN/ of a learner that follows, besides what `learner.alternation` leaves there
+    data-1.json, ...      what each round learns from: the rollouts that the store held when the round began
+    published.json        which version of the store each policy became; written before it is published
+
+A round learns from a snapshot, since the store grows meanwhile: so it can be resumed, and the same store gives the
+same policy. The validation objects are chosen among all that the store is about, before anything is collected, so that
+no object moves from one side to the other.
+"""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from learner import sharing
+from learner.data import kept_for_validation
+from learner.stages import StageJob
+from shared.errors import StoreError, UsageError
+from shared.files import read_bounded, write_atomically
+from shared.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
+from shared.store.layout import MAX_DOCUMENT_BYTES, SHARDS_FOLDER, STORE_FILE, parse_shard_id
+from shared.store.place import place_of
+from shared.store.snapshot import Snapshot
+from shared.store.store import Store
+
+PUBLISHED_FILE = "published.json"
+LINE_S = 60.0
+"""How often it is said that there is still too little."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """When there is enough to learn from.
+
+    Attributes:
+        first: rollouts in the store before the first round.
+        more: new rollouts before each further one.
+        poll_s: seconds between two looks.
+    """
+
+    first: int = 100
+    more: int = 30
+    poll_s: float = 5.0
+
+
+class Following:
+    """See `learner.alternation.Rounds`.
+
+    Args:
+        store: folder or URL; it need not be there yet.
+        out: the learner's folder.
+        pace: when there is enough.
+        sleep: waits for so many seconds.
+    """
+
+    at_least = 1
+
+    def __init__(self, store: str | Path, out: Path, pace: Pace, sleep: Callable[[float], None] = time.sleep) -> None:
+        self._out = out
+        self._pace = pace
+        self._sleep = sleep
+        self._store = self._wait_for_store(store)
+
+    def data(self, job: StageJob, number: int) -> StageJob:
+        """The job with what the store holds, once that is enough; the prior learns from what round 1 does."""
+        round_number = max(number, 1)
+        path = self._out / f"data-{round_number}.json"
+        if sharing.rank() == 0 and not path.exists():
+            self._out.mkdir(parents=True, exist_ok=True)
+            found = self._wait_for_rollouts(round_number)
+            write_atomically(path, found.model_dump_json().encode())
+        while not path.exists():
+            # Not a barrier, which would lose patience: collection may take hours.
+            self._sleep(self._pace.poll_s)
+        if job.train_objects is None and job.validation_objects is None:
+            named = [ref.id for ref in self._store.setting.objects]
+            job = replace(job, validation_objects=kept_for_validation(named))
+        return replace(job, snapshot=_read_snapshot(path))
+
+    def done(self, number: int, policy: Path) -> None:
+        """Publish the policy of a round."""
+        publish(self._store, self._out, f"round-{number}", policy)
+
+    def _wait_for_store(self, where: str | Path) -> Store:
+        place, said = place_of(where), False
+        while not (place.is_there() and place.exists(STORE_FILE)):
+            if not said and sharing.rank() == 0:
+                print(f"waiting for a store in {where}", flush=True)
+            said = True
+            self._sleep(self._pace.poll_s)
+        return Store.open(where)
+
+    def _wait_for_rollouts(self, number: int) -> Snapshot:
+        """What the store holds once that is enough for the round."""
+        before = 0 if number == 1 else _read_snapshot(self._out / f"data-{number - 1}.json").rollouts
+        wanted = self._pace.first if number == 1 else before + self._pace.more
+        said_at = -LINE_S
+        while True:
+            there = self._at_most()
+            if there >= wanted:
+                snapshot = Snapshot.of(self._store.parts())
+                there = snapshot.rollouts
+                if there >= wanted:
+                    return snapshot
+            if time.monotonic() - said_at >= LINE_S:
+                said_at = time.monotonic()
+                where = self._store.where
+                print(f"round {number} waits for {wanted} rollouts in {where}; {there} are there", flush=True)
+            self._sleep(self._pace.poll_s)
+
+    def _at_most(self) -> int:
+        """The most rollouts that the store can hold, by the names of its shards alone: cheap, so it is asked first."""
+        jobs = [parse_shard_id(name) for name in self._store.place.names(SHARDS_FOLDER)]
+        return sum(job.stop - job.start for job in jobs if job is not None)
+
+
+def publish(store: Store, out: Path, name: str, policy: Path) -> int | None:
+    """Put a policy into the store under the next free version, once; returns that version, in the first process.
+
+    Args:
+        store: where collectors look for it.
+        out: folder of the run, which remembers the version.
+        name: what the run calls the policy.
+        policy: folder of the stage that made it.
+
+    Raises:
+        StoreError: the store has another policy of that version by now, or the record is damaged.
+    """
+    if sharing.rank() > 0:
+        return None
+    versions = _published(out)
+    if name not in versions:
+        # Noted first: after a kill the same policy goes to the same version, where it may lie already.
+        versions[name] = max(store.policy_versions(), default=0) + 1
+        write_atomically(out / PUBLISHED_FILE, json.dumps(versions, indent=1).encode())
+    files = {file: read_bounded(policy / file, MAX_WEIGHTS_BYTES) for file in (WEIGHTS_FILE, POLICY_FILE)}
+    store.publish_policy(versions[name], files)
+    print(f"{store.where}: policy {versions[name]} is {policy}", flush=True)
+    return versions[name]
+
+
+def _published(out: Path) -> dict[str, int]:
+    path = out / PUBLISHED_FILE
+    if not path.exists():
+        return {}
+    try:
+        told = json.loads(read_bounded(path, MAX_DOCUMENT_BYTES))
+        return {str(name): int(version) for name, version in told.items()}
+    except (ValueError, AttributeError, TypeError, RecursionError):
+        raise StoreError(f"{path}: damaged; restore it, or choose another --out") from None
+
+
+def _read_snapshot(path: Path) -> Snapshot:
+    try:
+        return Snapshot.model_validate_json(read_bounded(path, MAX_DOCUMENT_BYTES))
+    except ValidationError:
+        raise UsageError(f"{path}: damaged; remove it to learn from what the store holds now") from None
