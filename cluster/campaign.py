@@ -176,10 +176,10 @@ class Campaign:
         return {**figures_of(collected), "policy": version}
 
     def _report(self) -> Mapping[str, Any]:
-        """Write summary.json and affordance.png."""
+        """Write summary.json, affordance.png and report.html; without experiments, whose crash would be the driver's."""
         from cluster.report import write_report
 
-        write_report(self._run, self._config)
+        write_report(self._run, self._config, experiments=False, say=self._say)
         return {}
 
     def _say(self, line: str) -> None:

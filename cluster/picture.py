@@ -9,19 +9,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
+from cluster.episodes import episodes, most_telling
 from shared.adaptation import Adapter
 from shared.policy import Policy
-from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
-from shared.vocabulary import Float, Float32, Interaction, Observation, Role
+from shared.vocabulary import Float, Float32, Interaction, Observation
 
-METHOD = "ours-final"
-CANDIDATES = 40
-"""Rollouts looked at, at the most, for the one that shows the most."""
 ARROW_LENGTH = 0.25
 """Of the arrow along the approach, in the cloud's units."""
 BODY_COLOUR = "0.8"
-COLOURS = "turbo"
+COLOURS = "viridis"
 
 
 def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
@@ -34,12 +31,11 @@ def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
         Whether there was any rollout to draw; if not, no file is written.
     """
     adapter = Adapter(policy)
-    rollouts = [r for shard in evaluation.committed() for r in evaluation.read_rollouts(shard.shard_id) if _tries(r)]
-    if not rollouts:
+    episode = most_telling(list(episodes(evaluation)), adapter)
+    if episode is None:
         return False
-    chosen = max(rollouts[:CANDIDATES], key=lambda rollout: _change(rollout, adapter))
-    tries = _tries(chosen)
-    panels = len(tries) + 1
+    chosen, history = episode.rollout, episode.history
+    panels = len(history) + 1
     figure = Figure(figsize=(3.6 * panels, 4.6), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     grid: Sequence[Axes] = figure.subplots(1, panels, squeeze=False)[0]
@@ -50,7 +46,6 @@ def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
         f"surface friction {dynamics.surface_friction:.2f}, {dynamics.direction.value})",
         fontsize=9,
     )
-    history = _history(chosen)
     observations = [history[0].observation, *(interaction.observation for interaction in history)]
     heat = [adapter.affordance(observation, history[:count]) for count, observation in enumerate(observations)]
     most = max(float(scores[o.movable].max()) for scores, o in zip(heat, observations, strict=True))
@@ -66,23 +61,6 @@ def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
     figure.colorbar(images[0], ax=list(grid), shrink=0.7, label="affordance (AAP)")
     figure.savefig(out, format="png")
     return True
-
-
-def _tries(rollout: RolloutRecord) -> list[InteractionRecord]:
-    return [row for row in rollout.interactions if row.role is Role.CONTEXT and row.method == METHOD]
-
-
-def _history(rollout: RolloutRecord) -> list[Interaction]:
-    return [Interaction(rollout.observations[row.observation], row.action, row.outcome) for row in _tries(rollout)]
-
-
-def _change(rollout: RolloutRecord, adapter: Adapter) -> float:
-    """How much the tries changed the affordance of movable points; more where a try succeeded."""
-    history = _history(rollout)
-    observation = history[0].observation
-    before, after = adapter.affordance(observation, []), adapter.affordance(observation, history)
-    moved = np.abs(after - before)[observation.movable]
-    return float(moved.mean()) + 0.1 * any(interaction.outcome.success for interaction in history)
 
 
 def _project(points: Float, observation: Observation) -> Float:

@@ -1,7 +1,8 @@
-"""The report of a run: summary.json for programs, a table for people, one picture."""
+"""The report of a run: summary.json for programs, a table and a page for people, one picture."""
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,15 @@ from shared.store import Store
 from shared.store.provenance import software_versions
 
 
-def write_report(run: RunFolder, config: CampaignConfig) -> None:
-    """Write summary.json and affordance.png from what the run's stages left."""
+def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, say: Callable[[str], None]) -> None:
+    """Write summary.json, affordance.png and report.html from what the run's stages left.
+
+    Args:
+        run: a run that was evaluated.
+        config: its configuration.
+        experiments: whether to try hidden facts in the simulator for the page.
+        say: is told what is under way.
+    """
     ledger, store = Ledger(run.log), Store.open(run.store)
     used = run.objects_used()
     versions = store.policy_versions()
@@ -45,6 +53,7 @@ def write_report(run: RunFolder, config: CampaignConfig) -> None:
     }
     write_atomically(run.summary, json.dumps(summary, indent=1, allow_nan=False).encode())
     _draw(run, versions[-1])
+    _write_page(run, config, experiments, say)
 
 
 def print_report(run: RunFolder) -> None:
@@ -85,6 +94,13 @@ def _draw(run: RunFolder, version: int) -> None:
     draw_adaptation(Store.open(run.evaluation), policy, run.picture)
 
 
+def _write_page(run: RunFolder, config: CampaignConfig, experiments: bool, say: Callable[[str], None]) -> None:
+    """Write the page; plotly takes a while to import, so only here."""
+    from cluster.reporting.writing import write_page
+
+    write_page(run, config, experiments=experiments, say=say)
+
+
 def _results_table(summary: dict[str, Any]) -> Table:
     table = Table(title=f"{summary['task']}: objects not seen in training")
     names = ("method", "budget", "f_score", "sample_success", "trials", "best_f", "bce", "auc", "base_rate")
@@ -120,7 +136,7 @@ def _lines(summary: dict[str, Any], run: RunFolder) -> list[str]:
         f"outcomes      {outcomes}",
         f"motions       {motions}",
         f"seconds       {stages}; in all {summary['wall_seconds']:g}",
-        f"files         {_shown(run.summary)}  {_shown(run.picture)}  {_shown(run.store)}",
+        f"files         {_shown(run.summary)}  {_shown(run.picture)}  {_shown(run.page)}  {_shown(run.store)}",
     ]
 
 

@@ -10,6 +10,7 @@ RUN/
   log.jsonl              the ledger: stages, times, results
   summary.json           figures
   affordance.png         one object before and after each try
+  report.html            all of it to look at, in one file
 """
 
 import json
@@ -91,9 +92,19 @@ class RunFolder:
         """The training stage that may have left an oracle."""
         return self.training("aap-1")
 
+    @property
+    def page(self) -> Path:
+        """report.html."""
+        return self.path / "report.html"
+
     def training(self, stage: str) -> Path:
         """What a training stage leaves."""
-        return self.path / "training" / stage
+        return self.trainings / stage
+
+    @property
+    def trainings(self) -> Path:
+        """What all training stages leave."""
+        return self.path / "training"
 
     def objects_used(self) -> ObjectsUsed:
         """What objects.json says."""

@@ -1,5 +1,6 @@
-"""`adaafford report`: print a run's results again."""
+"""`adaafford report`: a run's results as a page, and on the terminal again."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,10 +12,12 @@ from cluster.settings import parse_flags
 
 @dataclass(frozen=True, slots=True)
 class ReportCommand:
-    """Print the table of a finished run; summary.json and affordance.png are made anew."""
+    """Make RUN/report.html, summary.json and affordance.png of a finished run anew, and print its table."""
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run."""
+    experiments: bool = True
+    """Try a test object under other hidden facts in the simulator, and show what the affordance makes of it."""
 
 
 def main(args: list[str]) -> int:
@@ -26,6 +29,10 @@ def main(args: list[str]) -> int:
 
     run, config = find(command.run)
     if "evaluate" in Ledger(run.log).finished:
-        write_report(run, config)
+        write_report(run, config, experiments=command.experiments, say=_say)
     print_report(run)
     return 0
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

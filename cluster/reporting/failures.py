@@ -1,0 +1,71 @@
+"""Failures worth a look: exploits that the adapted critic believed in and that came to nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cluster.episodes import Episode
+from cluster.reporting.clouds import Arrow, Panel, draw_panels
+from cluster.reporting.page import Drawing, Section, plain
+from cluster.reporting.proposals import hidden, verdict
+from cluster.reporting.style import FAILURE
+from shared.adaptation import Adapter
+from shared.records import InteractionRecord
+from shared.vocabulary import Interaction
+
+SHOWN = 4
+LOOKED_AT = 60
+"""Failures that the critic is asked about, at the most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """An exploit that failed, and how much the critic believed in it."""
+
+    episode: Episode
+    row: InteractionRecord
+    belief: float
+
+
+def failures_section(episodes: Sequence[Episode], adapter: Adapter) -> Section:
+    """The failures at the greatest budget, one of each kind before any kind comes again."""
+    key, title = "failures", "Failure gallery"
+    last = [(episode, episode.exploits[-1]) for episode in episodes if episode.exploits]
+    failed = [(episode, row) for episode, row in last if not row.outcome.success]
+    counted = f"{len(failed)} of {len(last)} exploits at the greatest budget failed."
+    if not failed:
+        return Section(key, title, (counted if last else "Nothing was exploited.",))
+    chosen = varied([_believed(episode, row, adapter) for episode, row in failed[:LOOKED_AT]])
+    lead = (
+        f"{counted} Here those that the critic believed in most, one of each kind of failure before any comes again: "
+        "the adapted affordance, and the action that it chose (red).",
+    )
+    figure = draw_panels([_panel(failure, adapter) for failure in chosen], len(chosen), ("AAP: affordance",))
+    caption = "; ".join(
+        f"{failure.episode.rollout.object.id}: {hidden(failure.episode.rollout.dynamics)}" for failure in chosen
+    )
+    return Section(key, title, lead, drawings=(Drawing(figure, f"Hidden facts. {caption}.", solid=True),))
+
+
+def varied(failures: Sequence[Failure]) -> list[Failure]:
+    """Some failures in order of belief, each kind of outcome once before any comes again."""
+    turns: dict[str, int] = {}
+    ranked = []
+    for failure in sorted(failures, key=lambda each: -each.belief):
+        kind = failure.row.outcome.kind.value
+        turns[kind] = turns.get(kind, -1) + 1
+        ranked.append((turns[kind], failure))
+    return [failure for _, failure in sorted(ranked, key=lambda pair: pair[0])][:SHOWN]
+
+
+def _believed(episode: Episode, row: InteractionRecord, adapter: Adapter) -> Failure:
+    score = adapter.score(episode.seen_by(row), [row.action], episode.before(row))
+    return Failure(episode, row, float(score[0]))
+
+
+def _panel(failure: Failure, adapter: Adapter) -> Panel:
+    episode, row = failure.episode, failure.row
+    observation = episode.seen_by(row)
+    said = verdict(Interaction(observation, row.action, row.outcome))
+    title = f"{plain(episode.rollout.object.id)}: believed {100 * failure.belief:.0f}%<br>{plain(said)}"
+    values = adapter.affordance(observation, episode.before(row))
+    return Panel(title, observation, values, (Arrow(row.action, FAILURE),))

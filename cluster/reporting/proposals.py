@@ -1,0 +1,85 @@
+"""What AIP proposes to try, and what each try teaches, step by step (AdaAfford, Fig. 5)."""
+
+import numpy as np
+import plotly.graph_objects as go
+
+from cluster.episodes import Episode
+from cluster.reporting.clouds import Panel, draw_panels, proposed, tried
+from cluster.reporting.page import Drawing, Section, plain
+from shared.adaptation import Adapter, movable_points
+from shared.vocabulary import Direction, Float32, HiddenDynamics, Interaction, Observation
+
+MOST_TRIES = 3
+"""Two clouds a step; a browser draws no more than about sixteen at once."""
+
+
+def proposals_section(episode: Episode | None, adapter: Adapter) -> Section:
+    """The episode in which the tries of a run taught the most."""
+    key, title = "proposals", "What AIP proposes, and what each try teaches"
+    if episode is None:
+        return Section(key, title, ("No test object was tried by AIP.",))
+    rollout, history = episode.rollout, episode.history[:MOST_TRIES]
+    lead = (
+        f"{rollout.object.category} {rollout.object.id}, not seen in training; hidden: {hidden(rollout.dynamics)}. Of "
+        "the evaluation, the object whose affordance the tries changed the most.",
+        "Above: where AIP expects a try to tell most, from the least to the most of each cloud, and what it proposes "
+        "there (black). Below: the affordance after that many tries, with the last of them (green: success, red: failure). "
+        "Static parts are grey. Drag a cloud to turn all.",
+    )
+    return Section(key, title, lead, drawings=(Drawing(_figure(history, adapter), solid=True),))
+
+
+def hidden(dynamics: HiddenDynamics) -> str:
+    """Hidden dynamics in words."""
+    text = (
+        f"part mass {dynamics.part_mass:.2f} kg, joint friction {dynamics.joint_friction:.2f}, "
+        f"surface friction {dynamics.surface_friction:.2f}"
+    )
+    if dynamics.direction is Direction.AS_BUILT:
+        return text
+    return f"{text}, turns {'both ways' if dynamics.direction is Direction.BOTH else dynamics.direction.value}"
+
+
+def verdict(interaction: Interaction) -> str:
+    """What came of a try, in a few words."""
+    outcome = interaction.outcome
+    result = "success" if outcome.success else outcome.kind.value.replace("ok", "no success")
+    return f"{result}, moved {outcome.motion:.3f}"
+
+
+def _figure(history: list[Interaction], adapter: Adapter) -> go.Figure:
+    observations = [interaction.observation for interaction in history]
+    observations.append(observations[-1])
+    above, below = [], []
+    for count, observation in enumerate(observations):
+        before = history[:count]
+        arrows = (proposed(history[count].action),) if count < len(history) else ()
+        values = information(observation, before, adapter)
+        title = f"AIP, {_tries(count)}: at most {values.max():.2g}"
+        title += f"<br>proposes try {count + 1}" if arrows else "<br>&nbsp;"
+        above.append(Panel(title, observation, _stretched(values, observation), arrows))
+        shown = observations[count - 1] if count else observation
+        title = f"affordance, {_tries(count)}<br>" + (plain(verdict(before[-1])) if before else "&nbsp;")
+        arrows = (tried(before[-1]),) if before else ()
+        below.append(Panel(title, shown, adapter.affordance(shown, before), arrows, scale=1))
+    return draw_panels([*above, *below], len(observations), ("AIP: least to most", "AAP: affordance"))
+
+
+def information(observation: Observation, history: list[Interaction], adapter: Adapter) -> Float32:
+    """The AIP actionability of every point, [N]; 0 where nothing can be tried."""
+    values = np.zeros(len(observation.points), np.float32)
+    candidates = movable_points(observation)
+    values[candidates] = adapter.information(observation, candidates, adapter.z(history))
+    return values
+
+
+def _stretched(values: Float32, observation: Observation) -> Float32:
+    """Values of movable points from 0 for the least to 1 for the most: which point AIP prefers, however little."""
+    own = values[observation.movable]
+    low, high = own.min(initial=np.inf), own.max(initial=-np.inf)
+    stretched: Float32 = (values - low) / max(high - low, 1e-12)
+    return stretched
+
+
+def _tries(count: int) -> str:
+    return "before any try" if count == 0 else "after 1 try" if count == 1 else f"after {count} tries"

@@ -1,0 +1,106 @@
+"""Assembles RUN/report.html from what a run left."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from cluster.configuration import CampaignConfig
+from cluster.episodes import episodes, most_telling
+from cluster.reporting.collecting import collection_section
+from cluster.reporting.failures import failures_section
+from cluster.reporting.hidden_facts import (
+    Laboratory,
+    first_readable,
+    hidden_facts_section,
+    hinge_twins,
+)
+from cluster.reporting.page import Drawing, Page, Section, render, shortened
+from cluster.reporting.proposals import proposals_section
+from cluster.reporting.results import Results, results_section, tiles
+from cluster.reporting.training import training_section
+from cluster.run_folder import RunFolder, read_json
+from shared.adaptation import Adapter
+from shared.files import read_bounded, write_atomically
+from shared.policy import Policy
+from shared.store import Store
+
+MAX_PICTURE_BYTES = 4 << 20
+
+
+def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say: Callable[[str], None]) -> None:
+    """Write RUN/report.html.
+
+    Args:
+        run: a run with summary.json.
+        config: its configuration.
+        experiments: whether to try hidden facts in the simulator, which takes some seconds more.
+        say: is told what is under way.
+
+    Raises:
+        StoreError: a file of the run is damaged or foreign.
+    """
+    summary = read_json(run.summary)
+    store, evaluation = Store.open(run.store), Store.open(run.evaluation)
+    policy = Policy.from_files(store.read_policy(store.policy_versions()[-1]))
+    adapter, found = Adapter(policy), list(episodes(evaluation))
+    say("drawing tables, curves and clouds")
+    sections = [
+        results_section(_results(summary, config)),
+        proposals_section(most_telling(found, adapter), adapter),
+        _hidden_facts(run, evaluation, adapter, say) if experiments else _not_tried(run),
+        failures_section(found, adapter),
+        training_section(run.trainings, list(summary["stage_seconds"])),
+        collection_section(summary, store),
+    ]
+    if run.picture.is_file():
+        sections.insert(0, _picture(run.picture))
+    page = Page(
+        title=f"AdaAfford: {config.task}",
+        subtitle=_subtitle(summary, config),
+        tiles=tiles(_results(summary, config)),
+        sections=tuple(sections),
+        facts=_facts(summary, run),
+    )
+    write_atomically(run.page, render(page).encode())
+
+
+def _results(summary: Mapping[str, Any], config: CampaignConfig) -> Results:
+    return Results(config.task, summary["rows"], novel_categories=bool(config.splits.test_categories))
+
+
+def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Callable[[str], None]) -> Section:
+    used, setting = run.objects_used(), evaluation.setting
+    target = first_readable(Path(used.folder), used.test, setting)
+    with TemporaryDirectory(prefix="adaafford-report-") as folder:
+        return hidden_facts_section(Laboratory(setting, adapter), target, hinge_twins(setting, Path(folder)), say)
+
+
+def _not_tried(run: RunFolder) -> Section:
+    how = f"Made by `adaafford report {run.path}`, which tries test objects under other hidden facts in the simulator."
+    return Section("hidden-facts", "Affordance under hidden facts", (how,))
+
+
+def _picture(path: Path) -> Section:
+    caption = "Affordance before and after each try, as the camera sees it."
+    picture = Drawing(None, caption, picture=read_bounded(path, MAX_PICTURE_BYTES))
+    return Section("glance", "At a glance", drawings=(picture,))
+
+
+def _subtitle(summary: Mapping[str, Any], config: CampaignConfig) -> str:
+    objects = summary["objects"]
+    minutes = summary["wall_seconds"] / 60
+    return (
+        f"Affordance that adapts to one object after a few tries: {summary['interactions']:,} interactions with "
+        f"{len(objects['train'])} objects, judged on {len(objects['test'])} others, in {minutes:.0f} minutes "
+        f"(seed {config.seed}, {config.workers} workers)."
+    )
+
+
+def _facts(summary: Mapping[str, Any], run: RunFolder) -> tuple[tuple[str, str], ...]:
+    return (
+        ("run", str(run.path)),
+        ("objects", shortened(summary["objects"]["folder"])),
+        ("store digest", summary["store_digest"]),
+        ("software", ", ".join(f"{name} {version}" for name, version in summary["software"].items())),
+    )
