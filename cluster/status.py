@@ -1,6 +1,6 @@
 """How a collection stands: what its driver writes down every few seconds, and who else reads it.
 
-    STORE/underway/driver.json     replaced as a whole; about the moment, so no data and never in a digest
+    STORE/status/driver.json     replaced as a whole; about the moment, so no data and never in a digest
 
 The driver alone writes it, so it is read without asking the driver, on any machine that reaches the store, and also
 after the driver has ended.
@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError
 from shared.configuration import StrictModel
 from shared.errors import StoreError
 from shared.files import is_gone
-from shared.store.layout import UNDERWAY_FOLDER
+from shared.store.layout import STATUS_FOLDER
 from shared.store.place import Place
 
 BEAT_S = 2.0
@@ -25,7 +25,7 @@ BEAT_S = 2.0
 SILENT_S = 30.0
 """A driver that has written nothing for so long is not at work; clocks of machines may differ by some seconds."""
 MAX_STATUS_BYTES = 1 << 16
-_KEY = f"{UNDERWAY_FOLDER}/driver.json"
+_KEY = f"{STATUS_FOLDER}/driver.json"
 
 State = Literal["collecting", "waiting", "done", "stopped"]
 

@@ -6,19 +6,28 @@
 They lie in the store since that is all that workers and driver are sure to share. A file is named by the process that
 wrote it, so that none is ever taken for another's, however many have tried the same rollout. Nothing here is forced to
 the disk: a breadcrumb matters after the end of a process, not of a machine.
+
+Of a store in a bucket the breadcrumbs lie there too, but last words cannot: a handler of signals writes to an open file
+and no further. They stay on the worker's machine, and a driver on another one takes a crash for a loss.
 """
 
 import os
 import re
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from pydantic import Field, ValidationError
 
 from shared.configuration import StrictModel
 from shared.errors import StoreError
 from shared.files import is_gone, process_name, read_bounded
+
+if TYPE_CHECKING:
+    from shared.store.place import Place
+
+UNDERWAY_FOLDER = "underway"
 
 _CRUMB, _FAULT = ".json", ".fault"
 _CRUMB_BYTES = 256
@@ -40,7 +49,11 @@ class Crumb(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class Underway:
-    """The folder of breadcrumbs of one store.
+    """What is under way in one store.
+
+    Attributes:
+        folder: of the breadcrumbs and last words; of a store in a bucket, one on this machine for the last words alone.
+        url: of a store in a bucket.
 
     Example:
         underway.leave(Crumb(shard_id=job.shard_id, rollout=17))    # the worker's process
@@ -48,13 +61,18 @@ class Underway:
     """
 
     folder: Path
+    url: str = ""
 
     def leave(self, crumb: Crumb) -> None:
         """Say what this process does now.
 
         Raises:
+            StoreError: the bucket is out of reach.
             OSError: the file cannot be written; no older one is then left that would blame the wrong rollout.
         """
+        if self.url:
+            _place(self.url).replace(_key(process_name()), crumb.model_dump_json().encode())
+            return
         file = self._file(process_name(), _CRUMB)
         try:
             _overwrite(file, crumb.model_dump_json().encode())
@@ -73,9 +91,19 @@ class Underway:
     def crumb_of(self, process: str) -> Crumb | None:
         """What a process does, or did when it ended; None if it left no breadcrumb, or half of one."""
         try:
-            return Crumb.model_validate_json(self._read(process, _CRUMB))
+            return Crumb.model_validate_json(self._read_crumb(process))
         except ValidationError:
             return None
+
+    def crumbs(self) -> dict[str, Crumb]:
+        """What each process does that has not been forgotten, by its name."""
+        if self.url:
+            names = _place(self.url).names(UNDERWAY_FOLDER)
+        else:
+            names = sorted(file.name for file in self.folder.iterdir()) if self.folder.is_dir() else []
+        processes = [name.removesuffix(_CRUMB) for name in names if name.endswith(_CRUMB)]
+        found = {process: self.crumb_of(process) for process in processes}
+        return {process: crumb for process, crumb in found.items() if crumb is not None}
 
     def fault_of(self, process: str) -> str:
         """Of what a process died, in one line; "" if nothing within it brought it about."""
@@ -83,27 +111,51 @@ class Underway:
 
     def forget(self, process: str) -> None:
         """Remove what a process left."""
+        if self.url:
+            _place(self.url).remove(_key(process))
         for suffix in (_CRUMB, _FAULT):
             self._file(process, suffix).unlink(missing_ok=True)
 
     def sweep(self) -> int:
         """Remove what ended processes of this host left; returns how many files that was."""
-        if not self.folder.is_dir():
-            return 0
-        abandoned = [file for file in self.folder.iterdir() if is_gone(file.stem)]
-        for file in abandoned:
+        crumbs = [process for process in self.crumbs() if is_gone(process)] if self.url else []
+        files = [file for file in self.folder.iterdir() if is_gone(file.stem)] if self.folder.is_dir() else []
+        for process in crumbs:
+            _place(self.url).remove(_key(process))
+        for file in files:
             file.unlink(missing_ok=True)
-        return len(abandoned)
+        return len(crumbs) + len(files)
 
     def _file(self, process: str, suffix: str) -> Path:
         # Not `with_suffix`: a host's name may hold dots.
         return self.folder / f"{process}{suffix}"
+
+    def _read_crumb(self, process: str) -> bytes:
+        if not self.url:
+            return self._read(process, _CRUMB)
+        try:
+            return _place(self.url).read(_key(process), _MAX_BYTES)
+        except StoreError:
+            return b""
 
     def _read(self, process: str, suffix: str) -> bytes:
         try:
             return read_bounded(self._file(process, suffix), _MAX_BYTES)
         except StoreError:
             return b""
+
+
+@cache
+def _place(url: str) -> "Place":
+    """A bucket, whose client cannot travel between processes."""
+    from shared.store.place import place_of
+
+    return place_of(url)
+
+
+def _key(process: str) -> str:
+    """Of a breadcrumb, in a bucket."""
+    return f"{UNDERWAY_FOLDER}/{process}{_CRUMB}"
 
 
 def _overwrite(file: Path, data: bytes) -> None:

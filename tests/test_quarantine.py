@@ -246,3 +246,20 @@ def test_a_replayed_rollout_crashes_before_ones_eyes(tmp_path: Path) -> None:
     assert done.returncode == -signal.SIGSEGV
     assert "Fatal Python error: Segmentation fault" in done.stderr
     assert "in _replay" in done.stderr
+
+
+@pytest.mark.parametrize("kind", ["disk", "bucket"])
+def test_breadcrumbs_are_found_by_whoever_reaches_the_store(
+    kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    where = str(tmp_path / "store") if kind == "disk" else request.getfixturevalue("s3_url")
+    Store.create(where, fabricate_setting()).underway.leave(Crumb(shard_id=JOB.shard_id, rollout=5))
+    elsewhere = Store.open(where).underway
+    if kind == "bucket":
+        elsewhere = replace(elsewhere, folder=tmp_path / "of-another-machine")
+    assert elsewhere.crumbs() == {process_name(): Crumb(shard_id=JOB.shard_id, rollout=5)}
+    assert elsewhere.crumb_of(process_name()) == Crumb(shard_id=JOB.shard_id, rollout=5)
+    assert elsewhere.sweep() == 0, "this process is alive"
+    elsewhere.forget(process_name())
+    assert elsewhere.crumbs() == {}
+    assert elsewhere.crumb_of(process_name()) is None

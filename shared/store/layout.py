@@ -10,6 +10,7 @@
         manifest.json                counts, checksums, content digests, provenance; written last
       policies/<version>/            whatever the learner publishes, and index.json
       underway/                      breadcrumbs of live workers (`shared.underway`); no data
+      status/                        how the last collection stands (`cluster.status`); no data
       aside/                         what `store repair` or `store compact` took out; no data, and nothing reads it
 
 Names that begin with ".tmp-" are work in progress or its remnants; names that begin with ".lock-" are locks.
@@ -34,7 +35,7 @@ OBSERVATIONS_FOLDER = "observations.zarr"
 PLANS_FOLDER = "plans"
 SHARDS_FOLDER = "shards"
 POLICIES_FOLDER = "policies"
-UNDERWAY_FOLDER = "underway"
+STATUS_FOLDER = "status"
 LOCK_PREFIX = ".lock-"
 ASIDE_FOLDER = "aside"
 

@@ -33,7 +33,6 @@ from shared.store.layout import (
     POLICIES_FOLDER,
     SHARDS_FOLDER,
     STORE_FILE,
-    UNDERWAY_FOLDER,
     Quarantined,
     ShardManifest,
     StoreDocument,
@@ -47,7 +46,7 @@ from shared.store.sealed import seal, unseal
 from shared.store.snapshot import Snapshot
 from shared.store.tables import INTERACTION_SCHEMA, ROLLOUT_SCHEMA
 from shared.store.writer import commit_shard
-from shared.underway import Underway
+from shared.underway import UNDERWAY_FOLDER, Underway
 
 MAX_SEED = 2**64 - 1
 DRIVER = "driver"
@@ -351,11 +350,11 @@ class Store:
 
     @property
     def underway(self) -> Underway:
-        """Where workers leave their breadcrumbs: in the store, or on this machine if the store is in a bucket."""
+        """Where workers leave their breadcrumbs."""
         if is_url(self.where):
-            return Underway(
-                Path(gettempdir()) / f"adaafford-underway-{hashlib.sha256(self.where.encode()).hexdigest()[:16]}"
-            )
+            # Last words come from a handler of signals, which knows files alone.
+            name = f"adaafford-underway-{hashlib.sha256(self.where.encode()).hexdigest()[:16]}"
+            return Underway(Path(gettempdir()) / name, self.where)
         return Underway(self.path / UNDERWAY_FOLDER)
 
     def _committed_shard(self, shard_id: str) -> Folder:

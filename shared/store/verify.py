@@ -19,8 +19,8 @@ from shared.store.layout import (
     PLANS_FOLDER,
     POLICIES_FOLDER,
     SHARDS_FOLDER,
+    STATUS_FOLDER,
     STORE_FILE,
-    UNDERWAY_FOLDER,
     ShardManifest,
     parse_shard_id,
 )
@@ -28,6 +28,7 @@ from shared.store.place import Folder
 from shared.store.policies import INDEX_FILE, folder_name
 from shared.store.store import Store
 from shared.store.tables import column_values
+from shared.underway import UNDERWAY_FOLDER
 
 _FRAME_TOLERANCE = 1e-9
 """Camera-frame columns were computed by a matrix product, whose last bits depend on the machine."""
@@ -136,7 +137,7 @@ def _plans_and_policies(store: Store, shards: Sequence[Folder]) -> Iterator[Prob
 
 def _strangers(store: Store, shards: Sequence[Folder]) -> Iterator[Problem]:
     """Files and folders that the store did not make, and shards that were never committed."""
-    ours = {STORE_FILE, PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER, UNDERWAY_FOLDER, ASIDE_FOLDER}
+    ours = {STORE_FILE, PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER, UNDERWAY_FOLDER, STATUS_FOLDER, ASIDE_FOLDER}
     passing = (TEMPORARY_PREFIX, LOCK_PREFIX)
     for name in store.place.names(""):
         if name not in ours and not name.startswith(passing):
