@@ -2,7 +2,7 @@
 
 A robot's author implements `Environment` over a camera and an arm, and lets the policy choose:
 
->>> adapter = Adapter(Policy.from_files(open_store(path).read_policy(2)))
+>>> adapter = Adapter(load_policy("pull-closed-door"))
 >>> proposer, history = AipProposer(adapter, numpy.random.default_rng(1), budget=4), []
 >>> while (action := proposer.propose(observation := robot.observe(), history)) is not None:
 ...     history.append(Interaction(observation, action, robot.execute(action)))
@@ -11,6 +11,8 @@ A robot's author implements `Environment` over a camera and an arm, and lets the
 
 from importlib.metadata import version
 
+from adaafford.pretrained import load_policy
+from adaafford.scans import ScanFrame, checked_scan, observation_of, read_scan
 from shared.adaptation import Adapter
 from shared.errors import AdaAffordError
 from shared.policy import Policy
@@ -42,7 +44,12 @@ __all__ = [
     "OutcomeKind",
     "Policy",
     "Proposer",
+    "ScanFrame",
     "Store",
     "__version__",
+    "checked_scan",
+    "load_policy",
+    "observation_of",
     "open_store",
+    "read_scan",
 ]

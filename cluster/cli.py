@@ -20,6 +20,8 @@ COMMANDS = {
     "resume": "go on with a run that was stopped",
     "evaluate": "the table of the paper: F-score and sample-success of all methods, on any objects",
     "report": "print a run's results again",
+    "adapt": "propose the next try on a scanned object, and say where it can be moved",
+    "export-policy": "a run's policy in half precision with its model card, to take elsewhere",
     "collect": "collect interactions into a store, without any learning",
     "train": "prior, aap, aip or alternate: train from a store alone",
     "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
@@ -33,7 +35,7 @@ COMMANDS = {
 RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate")
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells more\n\n" + "\n".join(
-    f"  {name:<9}{text}" for name, text in COMMANDS.items()
+    f"  {name:<15}{text}" for name, text in COMMANDS.items()
 )
 
 
@@ -56,7 +58,7 @@ def run(args: list[str]) -> int:
     if name not in COMMANDS:
         return _complain(f"unknown command '{name}'; allowed: {', '.join(COMMANDS)}", 2)
     try:
-        code: int = import_module(f"cluster.commands.{name}").main(rest)
+        code: int = import_module(f"cluster.commands.{name.replace('-', '_')}").main(rest)
         sys.stdout.flush()
     except AdaAffordError as error:
         return _complain(str(error), error.exit_code)

@@ -92,6 +92,13 @@ class Policy:
             modules["where2act-adaptation"] = self.where2act_adaptation
         return nn.ModuleDict(modules)
 
+    def without_baselines(self) -> "Policy":
+        """A policy of the same prior, AAP and AIP, and of nothing that only an evaluation asks for."""
+        with torch.device("meta"):
+            kept = Policy(self.task, self.config, self.trained & {"prior", "aap", "aip"})
+        kept.prior, kept.aap, kept.aip = self.prior, self.aap, self.aip
+        return kept
+
     def with_trained(self, name: ModuleName) -> "Policy":
         """This policy, with `name` counted among the trained modules from here on."""
         self.trained |= {name}

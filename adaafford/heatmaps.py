@@ -1,0 +1,88 @@
+"""Heatmaps: a cloud with the affordance of each point, as PLY for viewers, NPZ for programs, HTML for people."""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import UsageError
+from shared.files import write_atomically
+from shared.vocabulary import Float, Float32
+
+
+def write_heatmap(path: Path, points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> None:
+    """Write the format that the name ends in.
+
+    Args:
+        path: .ply (coloured, with a property `affordance`), .npz (`points`, `affordance`, `indices`) or .html.
+        points: [N, 3], in the scan's frame.
+        affordance: [N], in [0, 1].
+        indices: [N], which points of the scan these are.
+
+    Raises:
+        UsageError: the name ends otherwise, or its folder cannot be written to.
+    """
+    writer = heatmap_writer(path)
+    try:
+        write_atomically(path, writer(points, affordance, indices))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written ({error.strerror}); name another place") from None
+
+
+def heatmap_writer(path: Path) -> Callable[[Float, Float32, NDArray[np.uint32]], bytes]:
+    """What makes the bytes of a heatmap of this name.
+
+    Raises:
+        UsageError: the name ends otherwise.
+    """
+    if path.suffix.lower() not in _WRITERS:
+        raise UsageError(f"{path}: not a kind of heatmap that is written; allowed: {', '.join(_WRITERS)}")
+    return _WRITERS[path.suffix.lower()]
+
+
+def colours(affordance: Float32) -> NDArray[np.uint8]:
+    """From dark blue (0) over white (0.5) to red (1), [N, 3]."""
+    low, middle, high = np.array([[30, 60, 140], [245, 245, 245], [200, 20, 30]], dtype=np.float64)
+    share = np.clip(affordance, 0.0, 1.0)[:, None].astype(np.float64)
+    mixed = np.where(share < 0.5, low + 2 * share * (middle - low), middle + (2 * share - 1) * (high - middle))
+    rounded: NDArray[np.uint8] = np.rint(mixed).astype(np.uint8)
+    return rounded
+
+
+def _ply(points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> bytes:
+    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    rows = np.zeros(len(points), dtype=[*fields, ("affordance", "<f4")])
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        rows[name] = colours(affordance)[:, channel]
+    rows["affordance"] = affordance
+    names = {"<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property {names[kind]} {name}" for name, kind in [*fields, ("affordance", "<f4")]]
+    return "\n".join([*header, "end_header\n"]).encode() + rows.tobytes()
+
+
+def _npz(points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> bytes:
+    held = io.BytesIO()
+    np.savez_compressed(held, points=points, affordance=affordance, indices=indices)
+    return held.getvalue()
+
+
+def _html(points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> bytes:
+    # Plotly takes a second to import and its page is some megabytes, so only where it is asked for.
+    import plotly.graph_objects as go
+
+    x, y, z = points.T
+    shown = [f"rgb({r},{g},{b})" for r, g, b in colours(affordance)]
+    marker = {"size": 3, "color": shown}
+    texts = [f"{value:.2f}" for value in affordance]
+    cloud = go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, text=texts, hoverinfo="text")
+    figure = go.Figure(cloud, {"scene": {"aspectmode": "data"}, "title": "affordance: blue 0, white 0.5, red 1"})
+    page: str = figure.to_html(include_plotlyjs=True, full_html=True)
+    return page.encode()
+
+
+_WRITERS = {".ply": _ply, ".npz": _npz, ".html": _html}

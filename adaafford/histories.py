@@ -1,0 +1,159 @@
+"""Histories: what was tried on one object so far, as a JSON file that people and robots may write.
+
+{
+  "format": "adaafford-history", "schema_version": 1,
+  "frame": {"up": [0, 0, 1], "camera": [0, 0, 0], "origin": [1.2, 0.1, 0.4]},
+  "interactions": [
+    {"cloud": "scan-1.ply", "point": [1.0, 0.3, 0.5], "approach": [1, 0, 0], "forward": [0, 0, 1],
+     "outcome": {"motion": 0.21}}
+  ]
+}
+
+Everything is in the frame of the clouds, in metres and radians; `cloud` names a file beside the history or below. An
+interaction without an outcome is a proposal that nobody has tried yet.
+"""
+
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from pydantic import Field, ValidationError, field_validator
+
+from adaafford.scans import ScanFrame, Vector, action_at
+from shared.configuration import StrictModel
+from shared.errors import UsageError
+from shared.files import read_bounded, write_atomically
+from shared.vocabulary import Action, Interaction, Observation, Outcome, OutcomeKind
+
+MAX_HISTORY_BYTES = 1 << 20
+MAX_TRIES = 64
+SUCCESS_MOTION = 0.01
+"""Motion that counts as a success unless it is said otherwise: tau, rad or m, as published."""
+
+
+class TriedOutcome(StrictModel):
+    """What came of a try."""
+
+    motion: float = Field(ge=0, le=100)
+    """How far the part moved: rad if it turns, m if it slides; 0 for nothing, or for a grasp that slipped."""
+    success: bool | None = None
+    """Whether it moved as intended (a pull pulled); where nothing is said, whether it moved by more than 0.01."""
+    kind: OutcomeKind = OutcomeKind.OK
+    """How the try ended; of what a simulator tells, a robot may know "no-contact" or "no-grasp"."""
+
+    @property
+    def outcome(self) -> Outcome:
+        """As policies are told it."""
+        moved = self.kind is OutcomeKind.OK and self.motion > SUCCESS_MOTION
+        return Outcome(self.kind, self.motion, moved if self.success is None else self.success)
+
+
+class TriedInteraction(StrictModel):
+    """One try, or a proposal for one."""
+
+    cloud: str = Field(min_length=1, max_length=1000)
+    """The scan that was taken before it: a path relative to the history, which does not lead out of its folder."""
+    point: Vector
+    """Where the fingertips go."""
+    approach: Vector
+    """The way the hand moves when it approaches."""
+    forward: Vector
+    """The hand's forward direction, which says how it is rolled (see docs/robot.md)."""
+    outcome: TriedOutcome | None = None
+    """None until it is tried."""
+
+    @field_validator("cloud")
+    @classmethod
+    def _stays_inside(cls, cloud: str) -> str:
+        path = PurePosixPath(cloud)
+        if path.is_absolute() or ".." in path.parts:
+            raise ValueError("needs a path relative to the history, without '..'")
+        return cloud
+
+
+class History(StrictModel):
+    """The contents of a history file."""
+
+    format: Literal["adaafford-history"] = "adaafford-history"
+    schema_version: Literal[1] = 1
+    frame: ScanFrame
+    interactions: tuple[TriedInteraction, ...] = Field((), max_length=MAX_TRIES)
+
+    @property
+    def pending(self) -> TriedInteraction | None:
+        """The proposal that waits for its outcome."""
+        return self.interactions[-1] if self.interactions and self.interactions[-1].outcome is None else None
+
+    @property
+    def tried(self) -> tuple[TriedInteraction, ...]:
+        """The tries that came to an end."""
+        return tuple(each for each in self.interactions if each.outcome is not None)
+
+    def proposing(self, action: Action, cloud: str) -> "History":
+        """This history with a proposal in its end, in the place of one that nobody tried."""
+        frame = self.frame
+        proposal = TriedInteraction(
+            cloud=cloud,
+            point=_rounded(frame.point_to_scan(action.point).tolist()),
+            approach=_rounded(frame.direction_to_scan(action.approach).tolist()),
+            forward=_rounded(frame.direction_to_scan(action.forward).tolist()),
+        )
+        return self.model_copy(update={"interactions": (*self.tried, proposal)})
+
+    def concluding(self, outcome: TriedOutcome) -> "History":
+        """This history with the outcome of its proposal.
+
+        Raises:
+            UsageError: no proposal waits for one.
+        """
+        if self.pending is None:
+            raise UsageError("the history has no proposal that waits for an outcome; ask for a proposal first")
+        last = self.pending.model_copy(update={"outcome": outcome})
+        return self.model_copy(update={"interactions": (*self.tried, last)})
+
+    def interactions_with(self, observe: Callable[[str], Observation]) -> list[Interaction]:
+        """The tries as a policy is told them.
+
+        Args:
+            observe: gives the observation of a cloud that the history names.
+
+        Raises:
+            UsageError: a cloud cannot be read, or a try does not lie on its cloud.
+        """
+        found = []
+        for each in self.tried:
+            assert each.outcome is not None, "a try has an outcome"
+            observation = observe(each.cloud)
+            action = action_at(observation, self.frame, each.point, each.approach, each.forward)
+            found.append(Interaction(observation, action, each.outcome.outcome))
+        return found
+
+
+def read_history(path: Path) -> History:
+    """Read a history, trusting nothing.
+
+    Raises:
+        UsageError: it is no history, with the first thing that is wrong.
+        StoreError: it is no regular file, or too large.
+    """
+    data = read_bounded(path, MAX_HISTORY_BYTES)
+    try:
+        history = History.model_validate_json(data)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        place = ".".join(map(str, problem["loc"])) or "the file"
+        raise UsageError(f"{path}: {place}: {problem['msg'][:150]}; docs/robot.md says what a history holds") from None
+    early = next((n for n, each in enumerate(history.interactions[:-1]) if each.outcome is None), None)
+    if early is not None:
+        raise UsageError(f"{path}: interactions.{early}: has no outcome though others follow; give it, or take it out")
+    return history
+
+
+def write_history(path: Path, history: History) -> None:
+    """Write a history; a reader finds the old one or the new."""
+    write_atomically(path, history.model_dump_json(indent=2).encode() + b"\n")
+
+
+def _rounded(vector: list[float]) -> Vector:
+    x, y, z = (round(value, 6) for value in vector)
+    return x, y, z

@@ -1,0 +1,179 @@
+"""A session: the loop of test time over files, for a robot that shares no process with the policy.
+
+Each step takes a scan and, if something was tried since the last one, its outcome; it leaves the proposal in the
+history and the adapted affordance in a heatmap. A session that is ended and begun again goes on from the history alone.
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from adaafford.heatmaps import heatmap_writer, write_heatmap
+from adaafford.histories import History, TriedOutcome, read_history, write_history
+from adaafford.scans import ScanFrame, Vector, observation_of, read_scan
+from shared import seeds
+from shared.adaptation import Adapter
+from shared.configuration import StrictModel
+from shared.errors import UsageError
+from shared.policy import Policy
+from shared.proposers import AipProposer, ExploitProposer
+from shared.vocabulary import Observation
+
+PURPOSE = "adapt"
+
+
+@dataclass(frozen=True, slots=True)
+class SessionFiles:
+    """What a session reads and writes.
+
+    Attributes:
+        history: the history, which need not be there yet; clouds lie in its folder or below.
+        heatmap: where the adapted affordance goes (see `adaafford.heatmaps`); None: nowhere.
+    """
+
+    history: Path
+    heatmap: Path | None
+
+
+class Step(StrictModel):
+    """What a session answers; everything in the scan's frame."""
+
+    do: Literal["try", "act"]
+    """"try" a proposal of AIP, which should teach most; "act": enough is known, this should succeed."""
+    tries: int
+    """How many tries the policy knows."""
+    point: Vector
+    approach: Vector
+    forward: Vector
+    belief: float
+    """The probability of success that the policy gives the action."""
+    seconds: float
+    """How long the step took."""
+
+
+class Request(StrictModel):
+    """One line that a robot writes to a session that follows it."""
+
+    cloud: str = Field(min_length=1, max_length=1000)
+    """A scan of the object as it stands."""
+    outcome: TriedOutcome | None = None
+    """Of what the last step said; None if it was not done."""
+
+    @classmethod
+    def read(cls, line: str) -> "Request":
+        """Read a line, trusting nothing.
+
+        Raises:
+            UsageError: it is no request.
+        """
+        try:
+            return cls.model_validate_json(line)
+        except ValidationError as error:
+            problem = error.errors()[0]
+            place = ".".join(map(str, problem["loc"])) or "the line"
+            raise UsageError(f"{place}: {problem['msg'][:150]}; write " + '{"cloud": "scan.ply"}') from None
+
+
+class Session:
+    """One object, from its first scan to the last.
+
+    Args:
+        policy: with prior, AAP and AIP trained.
+        files: what is read and written.
+        budget: how many tries AIP may propose.
+        seed: of what is drawn; a step that is asked for again is the same.
+        up: against gravity, in the frame of the scans; the history's where there is one, else 0 0 1.
+        camera: where the camera stood, likewise; else what the first scan says, else 0 0 0.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        files: SessionFiles,
+        budget: int = 4,
+        seed: int = 0,
+        up: Vector | None = None,
+        camera: Vector | None = None,
+    ) -> None:
+        policy.require("prior", "aap", "aip")
+        if files.heatmap is not None:
+            heatmap_writer(files.heatmap)
+        self._adapter = Adapter(policy)
+        self._files, self._budget, self._seed, self._up, self._camera = files, budget, seed, up, camera
+        self._observations: dict[str, Observation] = {}
+
+    def step(self, cloud: Path, outcome: TriedOutcome | None = None) -> Step:
+        """Take in what happened, and say what to do next.
+
+        Args:
+            cloud: a scan of the object as it stands.
+            outcome: of what the last step said; None if it was not done.
+
+        Raises:
+            UsageError: a file cannot be used, with the reason.
+        """
+        begun = time.perf_counter()
+        name = self._name_of(cloud)
+        history = self._history(cloud)
+        if outcome is not None:
+            history = history.concluding(outcome)
+        known = history.interactions_with(lambda each: self._observe(each, history.frame))
+        observation = self._observe(name, history.frame)
+        rng = seeds.generator(self._seed, PURPOSE, len(known))
+        action = AipProposer(self._adapter, rng, self._budget).propose(observation, known)
+        do: Literal["try", "act"] = "act" if action is None else "try"
+        if action is None:
+            action = ExploitProposer(self._adapter, rng).propose(observation, known)
+            assert action is not None, "an exploiter never stops"
+        if self._files.heatmap is not None:
+            heat = self._adapter.affordance(observation, known)
+            places = np.stack([history.frame.point_to_scan(p) for p in observation.points.astype(np.float64)])
+            write_heatmap(self._files.heatmap, places, heat, observation.pixels)
+        history = history.proposing(action, name)
+        write_history(self._files.history, history)
+        proposed = history.interactions[-1]
+        return Step(
+            do=do,
+            tries=len(known),
+            point=proposed.point,
+            approach=proposed.approach,
+            forward=proposed.forward,
+            belief=round(float(self._adapter.score(observation, [action], known)[0]), 4),
+            seconds=round(time.perf_counter() - begun, 3),
+        )
+
+    def _history(self, cloud: Path) -> History:
+        """The history that is there, or a new one around a first scan."""
+        if self._files.history.exists():
+            history = read_history(self._files.history)
+            for name, given in (("up", self._up), ("camera", self._camera)):
+                kept = getattr(history.frame, name)
+                if given is not None and given != kept:
+                    raise UsageError(f"{self._files.history}: was begun with {name} {kept}, now {given}; give the same")
+            return history
+        if not self._files.history.parent.is_dir():
+            raise UsageError(
+                f"{self._files.history.parent}: there is no such folder; make it, and put the clouds there"
+            )
+        frame = ScanFrame.around(read_scan(cloud), self._up or (0.0, 0.0, 1.0), self._camera)
+        return History(frame=frame)
+
+    def _name_of(self, cloud: Path) -> str:
+        """How a history in its folder names the cloud."""
+        folder = self._files.history.parent.resolve()
+        try:
+            return cloud.resolve().relative_to(folder).as_posix()
+        except ValueError:
+            raise UsageError(
+                f"{cloud}: does not lie beside the history or below; put it into {folder}, so that both stay together"
+            ) from None
+
+    def _observe(self, name: str, frame: ScanFrame) -> Observation:
+        """The observation of a cloud, made once, since the networks' work on it is remembered with it."""
+        if name not in self._observations:
+            self._observations[name] = observation_of(read_scan(self._files.history.parent / name), frame, self._seed)
+        return self._observations[name]
