@@ -88,10 +88,14 @@ class Blame:
             self._charge_no_rollout(job, failure, count)
         elif count >= (MAX_FAULTS if failure.fault else MAX_LOSSES):
             self._quarantined[job.plan_key, failure.rollout] = f"{failure.reason} ({count} times)"
-            logger.warning("rollout %d is quarantined: %s, %d times", failure.rollout, failure.reason, count)
+            about = {"shard": job.shard_id, "rollout": failure.rollout, "reason": failure.reason}
+            logger.warning(
+                "rollout %d is quarantined: %s, %d times", failure.rollout, failure.reason, count, extra=about
+            )
             return
         what = "before its rollouts or after them" if failure.rollout is None else f"in rollout {failure.rollout}"
-        logger.warning("job %s failed %s (%s); trying again", job.shard_id, what, failure.reason)
+        about = {"shard": job.shard_id, "rollout": failure.rollout, "reason": failure.reason}
+        logger.warning("job %s failed %s (%s); trying again", job.shard_id, what, failure.reason, extra=about)
 
     def _charge_no_rollout(self, job: Job, failure: Failure, count: int) -> None:
         if failure.fault and count >= MAX_FAULTS:

@@ -3,13 +3,13 @@
 Heavy packages are imported by the subcommands that need them, so that help is instant.
 """
 
-import logging
 import os
 import signal
 import sys
 from importlib import import_module
 from typing import NoReturn
 
+from cluster.logs import configure
 from shared.errors import AdaAffordError
 
 INTERRUPTED = 130
@@ -24,6 +24,7 @@ COMMANDS = {
     "export-policy": "a run's policy in half precision with its model card, to take elsewhere",
     "collect": "collect interactions into a store, without any learning",
     "train": "prior, aap, aip or alternate: train from a store alone",
+    "status": "how a run or a store stands: rate, done, left, workers",
     "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
     "store": "info, verify, digest, replay, repair, compact, merge or export: look after stores",
     "objects": "generate, check, preview or decompose: the objects",
@@ -41,7 +42,7 @@ USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells 
 
 def main() -> NoReturn:
     """Run the command line of this process and exit."""
-    logging.basicConfig(format="adaafford: %(message)s", level=logging.WARNING)
+    configure(os.environ)
     # As Ctrl-C does, so that workers and learners are ended in an orderly way.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     sys.exit(run(sys.argv[1:]))

@@ -12,11 +12,13 @@ from ray.exceptions import RayError, RayTaskError
 
 from cluster.blame import Blame, Failure, describe
 from cluster.fleet import WAIT_S, WorkerFactory
+from cluster.metrics import Cause, FleetMetrics
 from cluster.orders import Order, Orders
 from collector.actor import WorkerActor
 from collector.guard import Limits
 from shared.errors import AdaAffordError
 from shared.files import end_if_here
+from shared.plan import Plan
 from shared.underway import Crumb, Underway
 
 if TYPE_CHECKING:
@@ -56,10 +58,11 @@ class _Seat:
     retiring: bool = False
     """Whether it is only to finish what it has."""
 
-    def settle(self) -> None:
-        """Strike out the oldest pending job; the next one comes to the head."""
-        self.pending.popleft()
+    def settle(self) -> Order:
+        """Strike out the oldest pending job, and return it; the next one comes to the head."""
+        _, order = self.pending.popleft()
         self.busy_since, self.seen = time.monotonic(), None
+        return order
 
     def look(self, underway: Underway) -> tuple[Crumb | None, float]:
         """The breadcrumb of the rollout under way, and since when it has been seen unchanged."""
@@ -96,6 +99,7 @@ class RayFleet:
         self._looked = time.monotonic()
         self._seats = [_Seat() for _ in range(workers)]
         self._policies: dict[int, Any] = {}
+        self._metrics = FleetMetrics(workers)
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """See `Fleet.load_policy`: one `ray.put`; actors pull it when a plan first needs it."""
@@ -143,7 +147,7 @@ class RayFleet:
         for seat in self._seats:
             if seat.retiring and not seat.pending:
                 self._dismiss(seat)
-                self.restarts += 1
+                self._count_replaced("growth")
         for depth in range(IN_FLIGHT):
             for seat in self._seats:
                 if len(seat.pending) == depth and not seat.retiring:
@@ -180,9 +184,11 @@ class RayFleet:
             return
         if seat.arrival is not None:
             seat.arrival, seat.process, seat.busy_since = None, message, time.monotonic()
+            logger.info("a worker is up", extra={"worker": seat.process})
             return
-        seat.settle()
+        order = seat.settle()
         blame.acquit()
+        self._note_done(seat, order.plan, message)
         self._retire_if_grown(seat, message)
         on_receipt(message)
 
@@ -210,13 +216,22 @@ class RayFleet:
                     end_if_here(seat.process)
                     self._fail(seat, waiting, blame, f"took more than {limit:g} s, and had to be killed", fault=True)
 
+    def _note_done(self, seat: _Seat, plan: Plan, receipt: "Receipt") -> None:
+        """Tell log and metrics of a shard."""
+        self._metrics.add(plan, receipt)
+        about = {"plan": plan.key, "policy": plan.policy_version, "shard": receipt.shard_id, "worker": seat.process}
+        about |= {"interactions": receipt.interactions, "successes": receipt.successes}
+        about |= {"seconds": receipt.seconds.get("total", 0.0)}
+        logger.info("shard %s is committed", receipt.shard_id, extra=about)
+
     def _retire_if_grown(self, seat: _Seat, receipt: "Receipt") -> None:
         """Hand an actor no further jobs if its memory has grown by half of what it may grow by."""
         if seat.first_mb is None:
             seat.first_mb = receipt.memory_mb
         grown_mb = receipt.memory_mb - seat.first_mb
         if not seat.retiring and grown_mb > self._limits.memory_mb / 2:
-            logger.warning("a worker has grown by %.0f MB and is replaced", grown_mb)
+            about = {"worker": seat.process, "shard": receipt.shard_id}
+            logger.warning("a worker has grown by %.0f MB and is replaced", grown_mb, extra=about)
             seat.retiring = True
 
     def _fail(self, seat: _Seat, waiting: deque[Order], blame: Blame, reason: str, *, fault: bool) -> None:
@@ -224,12 +239,18 @@ class RayFleet:
         orders = [order for _, order in seat.pending]
         jobs = [order.job for order in orders]
         crumb = self._underway.crumb_of(seat.process)
+        about = {"worker": seat.process, "rollout": crumb.rollout if crumb else None, "reason": reason}
+        logger.info("a worker is replaced: %s", reason, extra=about)
         self._dismiss(seat)
-        self.restarts += 1
+        self._count_replaced("fault" if fault else "loss")
         waiting.extendleft(reversed(orders))
         job = next((job for job in jobs if crumb is not None and crumb.shard_id == job.shard_id), jobs[0])
         known = crumb is not None and crumb.shard_id == job.shard_id
         blame.charge(job, Failure(reason, crumb.rollout if known and crumb is not None else None, fault))
+
+    def _count_replaced(self, cause: Cause) -> None:
+        self.restarts += 1
+        self._metrics.replaced(cause)
 
     def _start(self, seat: _Seat) -> None:
         """Seat a new actor. No restarts by Ray: those would run only `__init__` again, and lose what was in flight."""

@@ -62,6 +62,16 @@ class DriverStatus(StrictModel):
     """Workers that were replaced."""
 
     @property
+    def per_s(self) -> float:
+        """Interactions a second over the whole attempt."""
+        return self.interactions / self.elapsed_s if self.elapsed_s else 0.0
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the interactions that succeeded; 0 before the first."""
+        return self.successes / self.interactions if self.interactions else 0.0
+
+    @property
     def left(self) -> int:
         """Rollouts to do."""
         return max(self.total - self.done, 0)

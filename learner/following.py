@@ -19,6 +19,7 @@ from pydantic import ValidationError
 
 from learner import sharing
 from learner.data import kept_for_validation
+from learner.names import PUBLISHED_FILE
 from learner.stages import StageJob
 from shared.errors import StoreError, UsageError
 from shared.files import read_bounded, write_atomically
@@ -28,7 +29,6 @@ from shared.store.place import place_of
 from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
-PUBLISHED_FILE = "published.json"
 LINE_S = 60.0
 """How often it is said that there is still too little."""
 

@@ -23,8 +23,9 @@ from learner.checkpoint import check_fingerprint, read_cursor
 from learner.configuration import LearnerConfig
 from learner.data import load_dataset, split, without_later
 from learner.hardware import Hardware
+from learner.names import METRICS_FILE
 from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FOLDER, Recipe, Runner
-from learner.training import CHECKPOINT_FILE, METRICS_FILE, TrainingResult, without_nan
+from learner.training import CHECKPOINT_FILE, TrainingResult, without_nan
 from shared.errors import UsageError
 from shared.files import read_bounded, write_atomically
 from shared.methods import ModuleName

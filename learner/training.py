@@ -22,11 +22,11 @@ from learner.checkpoint import Cursor, check_fingerprint, read_checkpoint, read_
 from learner.configuration import TrainingConfig
 from learner.events import EVENTS_FOLDER, EventFiles
 from learner.hardware import Hardware
+from learner.names import METRICS_FILE
 from learner.progress import ProgressReport, Standing
 from shared.errors import UsageError
 from shared.seeds import generator
 
-METRICS_FILE = "metrics.jsonl"
 CHECKPOINT_FILE = "checkpoint.safetensors"
 
 

@@ -13,7 +13,8 @@ from cluster.training import as_toml
 from learner.alternation import alternate
 from learner.configuration import AlternationConfig
 from learner.data import kept_for_validation, load_dataset, split
-from learner.following import PUBLISHED_FILE, Following, Pace, publish
+from learner.following import Following, Pace, publish
+from learner.names import PUBLISHED_FILE
 from learner.stages import DONE_FILE, StageJob
 from shared.errors import StoreError
 from shared.plan import Job, Plan

@@ -25,7 +25,8 @@ from learner.oracle import OracleCritic
 from learner.prior import PriorStage
 from learner.sampling import Batch, ProposalPool, order_rows
 from learner.stages import DONE_FILE, StageJob, read_policy_folder, run_stage
-from learner.training import METRICS_FILE, Stage, StepResult, train
+from learner.names import METRICS_FILE
+from learner.training import Stage, StepResult, train
 from shared.errors import UsageError
 from shared.policy import WEIGHTS_FILE, Policy
 from shared.records import InteractionRecord, RolloutRecord

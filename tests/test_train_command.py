@@ -23,9 +23,10 @@ from learner.alternation import ALTERNATION_FILE, alternate, converged
 from learner.configuration import AlternationConfig, LearnerConfig
 from learner.data import load_dataset, split, without_later
 from learner.hardware import Hardware
+from learner.names import METRICS_FILE
 from learner.progress import ProgressReport, Standing
 from learner.stages import DONE_FILE, StageJob, run_stage
-from learner.training import CHECKPOINT_FILE, METRICS_FILE
+from learner.training import CHECKPOINT_FILE
 from shared.errors import UsageError
 from shared.plan import Job
 from shared.policy import POLICY_FILE, WEIGHTS_FILE

@@ -1,0 +1,50 @@
+"""What is logged: one line for people, or a JSON object a line for machines, which names rollout and worker.
+
+    ADAAFFORD_LOG=json adaafford collect ... 2>log.jsonl
+
+Whoever logs gives what a line is about as `extra`, by the names in `FIELDS`; people get the message alone.
+"""
+
+import json
+import logging
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+VARIABLE = "ADAAFFORD_LOG"
+OURS = ("cluster", "collector", "learner", "shared")
+"""Packages of which machines are told more than warnings."""
+FIELDS = ("plan", "policy", "shard", "rollout", "worker", "interactions", "successes", "seconds", "reason")
+"""What a line may be about."""
+
+
+class JsonLines(logging.Formatter):
+    """A record as a JSON object in one line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See `logging.Formatter.format`."""
+        line = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        line |= {name: getattr(record, name) for name in FIELDS if hasattr(record, name)}
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+def configure(environment: Mapping[str, str]) -> None:
+    """Set up logging of this process, to standard error.
+
+    Args:
+        environment: ADAAFFORD_LOG=json asks for JSON lines, and for more of them.
+    """
+    if environment.get(VARIABLE) != "json":
+        logging.basicConfig(format="adaafford: %(message)s", level=logging.WARNING)
+        return
+    handler = logging.StreamHandler()
+    handler.setFormatter(JsonLines())
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    for name in OURS:
+        logging.getLogger(name).setLevel(logging.INFO)
