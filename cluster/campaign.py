@@ -155,7 +155,8 @@ class Campaign:
         plan = Plan(setting=store.setting, proposer=proposer, policy_version=version)
         open_fleet = partial(crew.for_store, store, folder)
         with store.only_driver():
-            collected = collect(store, plan, rollouts, self._config.rollouts.per_shard, open_fleet, folder)
+            wanted = self._config.rollouts.total(rollouts, len(store.setting.objects))
+            collected = collect(store, plan, wanted, self._config.rollouts.per_shard, open_fleet, folder)
         return figures_of(collected)
 
     def _evaluate(self, crew: Crew, version: int) -> Mapping[str, Any]:
@@ -165,7 +166,7 @@ class Campaign:
             store=Store.open(run.evaluation),
             policies=Store.open(run.store),
             version=version,
-            rollouts=rollouts.evaluation,
+            rollouts=rollouts.total(rollouts.evaluation, len(run.objects_used().test)),
             per_shard=rollouts.per_shard,
             objects=Path(run.objects_used().folder),
             oracle=run.oracle,
@@ -176,7 +177,7 @@ class Campaign:
         return {**figures_of(collected), "policy": version}
 
     def _report(self) -> Mapping[str, Any]:
-        """Write summary.json, affordance.png and report.html; without experiments, whose crash would be the driver's."""
+        """Write summary.json, affordance.png and report.html; no experiments, since a crash would be the driver's."""
         from cluster.report import write_report
 
         write_report(self._run, self._config, experiments=False, say=self._say)

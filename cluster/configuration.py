@@ -26,6 +26,13 @@ class RolloutCounts(StrictModel):
     """On test objects, which are not trained on."""
     per_shard: int = Field(4, ge=1, le=4096)
     """A job's size: what a worker does in one go, and what a kill can cost."""
+    per_object: bool = False
+    """Whether the first three are counted for each object, instead of all in all. As published: 4 draws of 32
+    interactions an object, and 10 trials a test object."""
+
+    def total(self, count: int, objects: int) -> int:
+        """How many rollouts `count` means where there are so many objects."""
+        return count * objects if self.per_object else count
 
 
 class SplitConfig(StrictModel):

@@ -37,14 +37,19 @@ def objects_for(
     """
     categories, folder = expanded(selection.categories), selection.objects or built_in
     if selection.objects is None:
-        wanted = [name for name in categories or CATEGORIES if not task.categories or name in task.categories]
-        generate(built_in, dict.fromkeys(wanted, per_category), seed)
+        generate(built_in, dict.fromkeys(built_in_categories(task, selection.categories), per_category), seed)
     lists = lists if selection.object_list is None else (selection.object_list,)
     catalogue = for_task(of_categories(scan(folder, *lists), categories), task)
     if not catalogue.usable:
         why = f"; the first: {catalogue.refused[0][0]}: {catalogue.refused[0][1]}" if catalogue.refused else ""
         raise UsageError(f"{folder}: none of {len(catalogue.refused)} objects suits the task '{task.name}'{why}")
     return catalogue, folder
+
+
+def built_in_categories(task: Task, categories: tuple[str, ...]) -> list[str]:
+    """The categories that built-in objects are made of: those that are named, or all, as far as the task applies."""
+    named = expanded(categories) or CATEGORIES
+    return [name for name in named if not task.categories or name in task.categories]
 
 
 def lists_of(splits: SplitConfig) -> tuple[Path, ...]:

@@ -79,7 +79,7 @@ def test_a_bad_configuration_file_is_refused(
 
 def test_an_unknown_preset_lists_those_there_are(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     line = complaint(capsys, "run", "--preset", "huge", "--out", str(tmp_path / "run"))
-    assert "unknown preset 'huge'; allowed: laptop, smoke" in line
+    assert "unknown preset 'huge'; allowed: laptop, paper, smoke" in line
 
 
 @pytest.mark.parametrize("args", [["--rollouts", "x"], ["--rolouts", "3"], ["--rollouts", "0"]])

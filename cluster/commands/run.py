@@ -8,6 +8,7 @@ import tyro
 
 from cluster.configuration import CampaignConfig
 from cluster.settings import early_flags, layered, parse_flags
+from shared.errors import UsageError
 from shared.tasks import task_named
 
 
@@ -19,21 +20,31 @@ class RunCommand:
     """
 
     settings: Annotated[CampaignConfig, tyro.conf.arg(name="")]
-    out: Path
-    """Folder of the run: new, empty, or of the same run."""
+    out: Path | None = None
+    """Folder of the run: new, empty, or of the same run. Only a dry run needs none."""
     preset: str = "smoke"
-    """A set of settings that the package brings: smoke or laptop."""
+    """A set of settings that the package brings: smoke, laptop or paper."""
     config: Path | None = None
     """A TOML file of settings, laid over the preset; flags are laid over both."""
+    dry_run: bool = False
+    """Only say what it will cost: interactions, core-hours and disk, by stage. Nothing is simulated or written."""
 
 
 def main(args: list[str]) -> int:
     """Run, or go on with, a campaign."""
     early = early_flags(args, "preset", "config")
     preset, config = early["preset"] or "smoke", Path(early["config"]) if early["config"] else None
-    defaults = RunCommand(layered(CampaignConfig, preset, config), tyro.MISSING, preset, config)
+    defaults = RunCommand(layered(CampaignConfig, preset, config), None, preset, config)
     command = parse_flags(RunCommand, args, "run", defaults)
     task_named(command.settings.task)
+    if command.dry_run:
+        from cluster.estimate import RATES, estimate
+        from cluster.estimate_table import print_estimate
+
+        print_estimate(estimate(command.settings), command.settings.workers, RATES)
+        return 0
+    if command.out is None:
+        raise UsageError("run needs --out FOLDER, or --dry-run to say what it will cost")
     from cluster.campaign import Campaign
     from cluster.run_folder import begin
 

@@ -1,0 +1,285 @@
+"""What a campaign will cost, before it is begun: interactions, core-hours and bytes by stage, from measured rates.
+
+Nothing is simulated and nothing is written. The rates are of one core of the machine that `RATES` names, unloaded;
+other machines differ by a factor, the shares of the stages hardly.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cluster.configuration import CampaignConfig
+from cluster.objects import built_in_categories, lists_of, objects_for, split_as_told
+from collector.catalogue import ObjectSplit
+from learner.configuration import AffordanceConfig
+from shared.errors import UsageError
+from shared.fps import FPS_PROPOSERS
+from shared.methods import METHODS, baselines_of
+from shared.networks.configuration import NetworkConfig
+from shared.networks.where2act_interaction import TRIES
+from shared.plan import ObjectRef
+from shared.policy import Policy
+from shared.tasks import Task, task_named
+from shared.vocabulary import Order
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Seconds of one core, and bytes.
+
+    Attributes:
+        measured: when, and on what.
+        push_s: a push at the fast fidelity; likewise of the other primitives that push.
+        pull_s: a pull.
+        reference_push_s: a push at the published timing, where it is stepped as published.
+        reference_pull_s: a pull likewise.
+        object_s: reading an object, and letting a state come to rest.
+        look_s: a depth image and its cloud.
+        write_s: a rollout's share of a shard.
+        multiply_add_s: a multiplication in PointNet++, forward and backward.
+        cloud_s: what a cloud takes beside that.
+        scored_row_s: an action through a critic, forward.
+        trained_row_s: forward and backward.
+        point_bytes: a point of a stored cloud.
+        row_bytes: a stored interaction without its cloud.
+        shard_bytes: what else a shard holds.
+    """
+
+    measured: str
+    push_s: float
+    pull_s: float
+    reference_push_s: float
+    reference_pull_s: float
+    object_s: float
+    look_s: float
+    write_s: float
+    multiply_add_s: float
+    cloud_s: float
+    scored_row_s: float
+    trained_row_s: float
+    point_bytes: float
+    row_bytes: float
+    shard_bytes: float
+
+
+RATES = Rates(
+    measured="2026-11-22, one core of an AMD EPYC: `adaafford bench collect`, PointNet++ and critics by themselves",
+    push_s=0.016,
+    pull_s=0.050,
+    reference_push_s=0.34,
+    reference_pull_s=0.92,
+    object_s=0.11,
+    look_s=0.020,
+    write_s=0.021,
+    multiply_add_s=9.1e-11,
+    cloud_s=0.0085,
+    scored_row_s=5e-6,
+    trained_row_s=12e-6,
+    point_bytes=9.2,
+    row_bytes=385,
+    shard_bytes=8600,
+)
+FORWARD_SHARE = 0.6
+"""Of forward and backward."""
+LEFT_BY_TRAINING = 5
+"""Copies of the weights that a training stage leaves: latest, best, two moments of Adam, the policy."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageCost:
+    """What one stage will cost."""
+
+    stage: str
+    interactions: int
+    core_s: float
+    size_bytes: float
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What a campaign will cost.
+
+    Attributes:
+        task: which it is.
+        objects: how many are trained on, validate and are tested on.
+        stages: in order.
+    """
+
+    task: str
+    objects: tuple[int, int, int]
+    stages: tuple[StageCost, ...]
+
+
+def estimate(config: CampaignConfig, rates: Rates = RATES) -> Estimate:
+    """The cost of a campaign.
+
+    Raises:
+        UsageError: a folder or list of objects cannot be read, or too few suit the task.
+    """
+    parts = _objects(task_named(config.task), config)
+    counts = len(parts.train), len(parts.validation), len(parts.test)
+    if not counts[0] or not counts[2]:
+        raise UsageError(f"{sum(counts)} usable objects are too few to train on some and test on others")
+    return Estimate(config.task, counts, tuple(_Costs(config, counts, rates).stages()))
+
+
+def _objects(task: Task, config: CampaignConfig) -> ObjectSplit:
+    """The split that the campaign will make; built-in objects are counted without being made."""
+    if config.objects is not None:
+        catalogue, _ = objects_for(task, config, Path(), 0, config.seed, lists_of(config.splits))
+        refs = [entry.ref for entry in catalogue.usable]
+    else:
+        refs = [
+            ObjectRef(id=f"{category}-{number}", category=category, content_hash="0" * 64)
+            for category in built_in_categories(task, config.categories)
+            for number in range(config.procedural.per_category)
+        ]
+    return split_as_told(refs, config.splits, config.seed)
+
+
+class _Costs:
+    """The stages of a campaign, one after another."""
+
+    def __init__(self, config: CampaignConfig, objects: tuple[int, int, int], rates: Rates) -> None:
+        self.config, self.rates = config, rates
+        self.task = task_named(config.task)
+        train, validation, self.tested = objects
+        self.collected_on = train + validation
+        camera, network = config.collection.camera, config.learner.network
+        self.encode_s = rates.cloud_s + rates.multiply_add_s * multiply_adds(network, camera.points)
+        with torch.device("meta"):
+            weights = Policy(self.task.name, network).modules()
+        self.weights_bytes = 4.0 * sum(tensor.numel() for tensor in weights.parameters())
+        self.clouds = 0
+
+    def stages(self) -> Iterator[StageCost]:
+        """As `cluster.campaign.Campaign.stages` has them; what costs next to nothing is left out."""
+        rollouts, learner = self.config.rollouts, self.config.learner
+        yield self._collection("collect-random", rollouts.total(rollouts.random, self.collected_on), tries=0)
+        yield self._training("train-prior", self._prior_s())
+        for version in range(1, self.config.alternations + 2):
+            if version > 1:
+                count = rollouts.total(rollouts.aip, self.collected_on)
+                yield self._collection(f"collect-aip-{version - 1}", count, self.config.collection.rollout.context)
+            yield self._training(f"train-aap-{version}", self._aap_s(first=version == 1))
+            yield self._training(f"train-aip-{version}", self._aip_s())
+        for name in baselines_of(self.config.evaluation.methods):
+            if name == "where2act-interaction":
+                told = learner.interaction
+                clouds = told.batch_rollouts * self._clouds_a_rollout(0)
+                rows = told.batch_rollouts * told.rows_per_rollout * (TRIES + 1)
+                seconds = self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance)
+            else:
+                rows = learner.adaptation.batch_rollouts * learner.adaptation.rows_per_rollout
+                seconds = self._steps_s(learner.adaptation.steps, 0, rows * learner.adaptation.context)
+            yield self._training(f"train-{name}", seconds)
+        yield self._evaluation(rollouts.total(rollouts.evaluation, self.tested))
+
+    def _collection(self, stage: str, rollouts: int, tries: int) -> StageCost:
+        interactions = rollouts * self.config.collection.rollout.interactions
+        clouds = rollouts * (self._clouds_a_rollout(tries))
+        self.clouds += clouds
+        return StageCost(
+            stage,
+            interactions,
+            self._simulation_s(rollouts, interactions, clouds) + rollouts * tries * self._policy_step_s(),
+            self._stored_bytes(rollouts, interactions, clouds),
+        )
+
+    def _evaluation(self, rollouts: int) -> StageCost:
+        """Random queries, then every method's tries, each from a state of its own, and its actions."""
+        told = self.config.evaluation
+        methods = [METHODS[name] for name in told.methods]
+        tries = [max(method.budgets(told.budgets)) if method.tries else 0 for method in methods]
+        chosen = sum(len(method.budgets(told.budgets)) for method in methods)
+        by_policy = chosen + sum(n for n, m in zip(tries, methods, strict=True) if m.tries in (*FPS_PROPOSERS, "aip"))
+        interactions = rollouts * (told.queries + sum(tries) + chosen)
+        clouds = rollouts * (1 + sum(tries))
+        judging_s = clouds * FORWARD_SHARE * self.encode_s * 3
+        return StageCost(
+            "evaluate",
+            interactions,
+            self._simulation_s(rollouts, interactions, clouds)
+            + rollouts * by_policy * self._policy_step_s()
+            + judging_s,
+            self._stored_bytes(rollouts, interactions, clouds) + self.weights_bytes,
+        )
+
+    def _training(self, stage: str, seconds: float) -> StageCost:
+        """A stage encodes every cloud once or twice for its frozen networks, apart from its steps."""
+        return StageCost(stage, 0, seconds + self.clouds * self.encode_s, LEFT_BY_TRAINING * self.weights_bytes)
+
+    def _prior_s(self) -> float:
+        told = self.config.learner.prior
+        actions = told.batch_clouds * told.actions_per_cloud
+        # About one action in five succeeds and is sought among proposals.
+        rows = actions * (1 + told.proposals // 5)
+        return self._steps_s(told.steps, told.batch_clouds, rows) + self._affordance_s(told.affordance)
+
+    def _aap_s(self, first: bool) -> float:
+        told = self.config.learner.aap
+        steps = told.steps + (told.oracle_steps if first and told.training == "privileged" else 0)
+        clouds = told.batch_rollouts * self._clouds_a_rollout(0)
+        rows = told.batch_rollouts * told.rows_per_rollout * (told.context + 1)
+        return self._steps_s(steps, clouds, rows) + self._affordance_s(told.affordance)
+
+    def _aip_s(self) -> float:
+        told = self.config.learner.aip
+        clouds = told.batch_rollouts * self._clouds_a_rollout(0) if told.training == "paper" else 0
+        rows = told.batch_rollouts * told.rows_per_rollout * told.draws * (told.context + 1)
+        return self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance)
+
+    def _affordance_s(self, told: AffordanceConfig) -> float:
+        return told.steps * told.points * told.proposals * self.rates.scored_row_s
+
+    def _steps_s(self, steps: int, clouds: int, rows: int) -> float:
+        return steps * (clouds * self.encode_s + rows * self.rates.trained_row_s)
+
+    def _simulation_s(self, rollouts: int, interactions: int, clouds: int) -> float:
+        rates, pulls = self.rates, self.task.terms(self.config.collection).primitive.pulls
+        if self.config.collection.fidelity.name == "reference":
+            trial_s = rates.reference_pull_s if pulls else rates.reference_push_s
+        else:
+            trial_s = rates.pull_s if pulls else rates.push_s
+        return rollouts * (rates.object_s + rates.write_s) + interactions * trial_s + clouds * rates.look_s
+
+    def _policy_step_s(self) -> float:
+        """One look of the prior, AAP and AIP, and a hundred proposals at every step."""
+        points = self.config.collection.camera.points
+        return 3 * FORWARD_SHARE * self.encode_s + 2 * (points + 100) * self.rates.scored_row_s
+
+    def _clouds_a_rollout(self, tries: int) -> int:
+        """How often a rollout looks: before each try that a policy chose, then before each state's random ones."""
+        told = self.config.collection.rollout
+        left = max(0, told.interactions - tries)
+        if told.order is Order.CONTINUE and not tries:
+            return left
+        return tries + (min(left, 1) if self.task.closed else -(-left // told.actions_per_state))
+
+    def _stored_bytes(self, rollouts: int, interactions: int, clouds: int) -> float:
+        rates, points = self.rates, self.config.collection.camera.points
+        shards = -(-rollouts // self.config.rollouts.per_shard)
+        return interactions * rates.row_bytes + clouds * points * rates.point_bytes + shards * rates.shard_bytes
+
+
+def multiply_adds(network: NetworkConfig, points: int) -> float:
+    """Multiplications that PointNet++ makes of a cloud, forward."""
+    sizes = [points, *(min(count, points) for count in network.centres)]
+    total, width = 0, 0
+    widths = [0]
+    for size, layers in zip(sizes[1:], network.abstraction, strict=True):
+        total += size * network.neighbours * _layers(width + 3, layers)
+        width = layers[-1]
+        widths.append(width)
+    for level, layers in enumerate(network.propagation):
+        fine = len(sizes) - 2 - level
+        total += sizes[fine] * _layers(width + widths[fine], layers)
+        width = layers[-1]
+    return float(total)
+
+
+def _layers(width: int, layers: tuple[int, ...]) -> int:
+    return int(np.dot((width, *layers[:-1]), layers))

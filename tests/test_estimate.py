@@ -1,0 +1,98 @@
+"""The cost of a campaign, told beforehand: of the stages that there will be, and without a trace."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from cluster.campaign import Campaign, Crew
+from cluster.cli import run as adaafford
+from cluster.configuration import CampaignConfig, RolloutCounts
+from cluster.estimate import RATES, Estimate, StageCost, estimate, multiply_adds
+from cluster.run_folder import RunFolder
+from cluster.settings import layered, preset_names
+from shared.methods import METHODS
+from shared.networks.configuration import NETWORKS
+
+FREE = ("objects", "publish", "report")
+
+
+def stage(found: Estimate, name: str) -> StageCost:
+    return next(each for each in found.stages if each.stage == name)
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_stage_of_a_preset_has_its_cost(name: str, tmp_path: Path) -> None:
+    config = layered(CampaignConfig, name, None)
+    crew = Crew(lambda *_: pytest.fail("a fleet was asked for"))
+    names = [each.name for each in Campaign(RunFolder(tmp_path), config).stages(crew)]
+    found = estimate(config)
+    assert [each.stage for each in found.stages] == [name for name in names if not name.startswith(FREE)]
+    assert all(each.core_s > 0 and each.size_bytes > 0 for each in found.stages)
+
+
+def test_the_published_scale_is_the_published_one() -> None:
+    """972 shapes; 4 draws of 32 interactions each; 10 trials a test shape of every method."""
+    config = layered(CampaignConfig, "paper", None)
+    found = estimate(config)
+    train, validation, test = found.objects
+    assert train + validation + test == pytest.approx(972, abs=5)
+    assert stage(found, "collect-random").interactions == (train + validation) * 4 * 32
+    assert set(config.evaluation.methods) == set(METHODS)
+    assert config.learner.network == NETWORKS["published"]
+    assert stage(found, "evaluate").interactions % (10 * test) == 0
+
+
+def test_cost_grows_with_what_is_asked_for() -> None:
+    def of(**changes: object) -> Estimate:
+        return estimate(CampaignConfig.model_validate({"task": "push", **changes}))
+
+    once, twice = of(rollouts={"random": 100}), of(rollouts={"random": 200})
+    assert stage(twice, "collect-random").core_s == pytest.approx(2 * stage(once, "collect-random").core_s)
+    assert stage(twice, "collect-random").size_bytes == pytest.approx(2 * stage(once, "collect-random").size_bytes)
+    exact = of(collection={"fidelity": {"name": "reference"}})
+    assert stage(exact, "collect-random").core_s > 5 * stage(once, "collect-random").core_s
+    assert stage(of(task="pull"), "collect-random").core_s > stage(once, "collect-random").core_s
+    some, all_methods = of(evaluation={"methods": ["where2act"]}), of(evaluation={"methods": list(METHODS)})
+    assert stage(all_methods, "evaluate").core_s > 3 * stage(some, "evaluate").core_s
+
+
+def test_rates_are_of_their_stages_alone() -> None:
+    config = CampaignConfig(task="pull")
+    slow = dataclasses.replace(RATES, pull_s=10 * RATES.pull_s)
+    before, after = estimate(config), estimate(config, slow)
+    changed = [one.stage for one, two in zip(before.stages, after.stages, strict=True) if one != two]
+    assert changed == ["collect-random", "collect-aip-1", "evaluate"]
+
+
+def test_larger_networks_and_clouds_cost_more() -> None:
+    small, published = (NETWORKS[name] for name in ("small", "published"))
+    assert multiply_adds(small, 2048) < multiply_adds(small, 4096) < multiply_adds(published, 10_000)
+
+
+def test_counts_may_be_of_each_object() -> None:
+    assert RolloutCounts().total(4, 10) == 4
+    assert RolloutCounts(per_object=True).total(4, 10) == 40
+
+
+def test_a_dry_run_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert adaafford(["run", "--dry-run", "--preset", "laptop", "--out", "run"]) == 0
+    out = capsys.readouterr().out
+    assert "collect-random" in out
+    assert "19,200" in out
+    assert "measured" in out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_needs_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    assert adaafford(["run"]) == 2
+    assert "needs --out FOLDER" in capsys.readouterr().err
+
+
+@pytest.mark.real_objects
+def test_the_objects_of_a_folder_are_counted_as_they_will_be_split(real_objects: Path) -> None:
+    found = estimate(CampaignConfig(task="push-faucet", objects=real_objects))
+    assert sum(found.objects) >= 2
