@@ -102,7 +102,8 @@ def _chosen(store: Store, rows: int, seed: int) -> dict[str, list[tuple[int, int
 
 def _again(store: Store, objects: Path, record: RolloutRecord, row: InteractionRecord) -> Outcome:
     collection = store.setting.collection
-    scene = Scene(load_ref(objects, record.object, collection.collision), record.dynamics, collection.fidelity)
+    target = load_ref(objects, record.object, collection.collision)
+    scene = Scene(target, record.dynamics, collection.fidelity, row.primitive)
     if record.dynamics.direction is not Direction.AS_BUILT:
         scene.restrict(first_positions(row.joint_limits, record.dynamics.direction))
     scene.put(row.joint_positions)

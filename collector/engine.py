@@ -15,7 +15,6 @@ with warnings.catch_warnings():
     from sapien import physx
 
 from collector.articulation import Mesh
-from shared.configuration import Fidelity
 from shared.vocabulary import Float
 
 Link: TypeAlias = physx.PhysxArticulationLinkComponent
@@ -25,7 +24,7 @@ DENSITY = 1000.0
 __all__ = ["DENSITY", "Assembly", "Link", "new_scene", "physx", "pose", "sapien", "set_mass"]
 
 
-def new_scene(fidelity: Fidelity) -> tuple[sapien.Scene, physx.PhysxCpuSystem]:
+def new_scene(solver_iterations: int) -> tuple[sapien.Scene, physx.PhysxCpuSystem]:
     """An empty scene with the published engine settings, and its physics system."""
     config = physx.PhysxSceneConfig()
     config.gravity = np.array([0.0, 0.0, -9.81], dtype=np.float32)
@@ -34,12 +33,11 @@ def new_scene(fidelity: Fidelity) -> tuple[sapien.Scene, physx.PhysxCpuSystem]:
     config.enable_enhanced_determinism = True
     physx.set_scene_config(config)
     body = physx.PhysxBodyConfig()
-    body.solver_position_iterations = fidelity.solver_iterations
+    body.solver_position_iterations = solver_iterations
     body.solver_velocity_iterations = 1
     body.sleep_threshold = 0.0
     physx.set_body_config(body)
     system = physx.PhysxCpuSystem()
-    system.set_timestep(1.0 / fidelity.steps_per_second)
     return sapien.Scene([system]), system
 
 

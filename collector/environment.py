@@ -53,7 +53,7 @@ class SapienEnvironment:
         self.primitive = primitive
         self.qualifying = qualifying_parts(target, task)
         with clock.stage("load"):
-            self.scene = Scene(target, dynamics, fidelity)
+            self.scene = Scene(target, dynamics, fidelity, primitive)
         self._camera = camera_for(target, world_from_camera, camera)
         self._camera_config = camera
         self._fidelity = fidelity
@@ -127,7 +127,7 @@ class SapienEnvironment:
         return seen
 
     def _settle(self) -> bool:
-        rate = self._fidelity.steps_per_second / 240
+        rate = self._fidelity.approach.steps_per_second / 240
         self._disturbed = False
         with self._clock.stage("settle"):
             return self.scene.settle(round(SETTLE_STEPS * rate), round(SETTLE_MOST * rate))

@@ -37,6 +37,14 @@ class Gripper(Protocol):
     palm: Link
     fingers: tuple[Link, Link]
 
+    def set_pace(self, pace: float) -> None:
+        """Prepare for moving `pace` times faster than published.
+
+        The dampers of the drives become weaker by as much, so that they exert the published forces: what is slow enough
+        to be governed by forces alone then comes out the same.
+        """
+        ...
+
     def place(self, rotation: Float, position: Float, opening: float) -> None:
         """Put the hand somewhere at rest, each finger open by `opening`, with the drives holding it there.
 
@@ -124,14 +132,18 @@ class FreeGripper:
         self._articulation = palm.articulation
         self._drive = physx.PhysxDriveComponent(palm)
         palm.entity.add_component(self._drive)
+        self._rotation, self._origin = np.eye(3), np.zeros(3)
+
+    def set_pace(self, pace: float) -> None:
+        """See `Gripper.set_pace`."""
         for set_property in (
             self._drive.set_drive_property_x,
             self._drive.set_drive_property_y,
             self._drive.set_drive_property_z,
             self._drive.set_drive_property_slerp,
         ):
-            set_property(ARM_STIFFNESS, ARM_DAMPING)
-        self._rotation, self._origin = np.eye(3), np.zeros(3)
+            set_property(ARM_STIFFNESS, ARM_DAMPING / pace)
+        set_finger_pace(self.fingers, pace)
 
     def place(self, rotation: Float, position: Float, opening: float) -> None:
         """See `Gripper.place`."""
@@ -178,7 +190,10 @@ class FreeGripper:
 
 
 def add_gripper(scene: sapien.Scene, material: physx.PhysxMaterial) -> FreeGripper:
-    """Build the free hand into a scene, weightless, as the published gravity compensation makes it."""
+    """Build the free hand into a scene, weightless, as the published gravity compensation makes it.
+
+    Its drives have no strength until `set_pace`.
+    """
     assembly = Assembly(material)
     hand = assembly.add(None, "palm", (palm(),), joint="undefined", touches_own_kind=False)
     fingers = add_fingers(assembly, hand)
@@ -188,7 +203,7 @@ def add_gripper(scene: sapien.Scene, material: physx.PhysxMaterial) -> FreeGripp
 
 
 def add_fingers(assembly: Assembly, hand: Link) -> tuple[Link, Link]:
-    """Hang the two fingers on the palm's link `hand`, with their drives."""
+    """Hang the two fingers on the palm's link `hand`; their drives have no strength until `set_finger_pace`."""
     left, right = (_add_finger(assembly, hand, *named) for named in (("left", 1.0), ("right", -1.0)))
     return left, right
 
@@ -205,9 +220,14 @@ def _add_finger(assembly: Assembly, hand: Link, name: str, side: float) -> Link:
         limits=(0.0, FINGER_OPEN),
         touches_own_kind=False,
     )
-    link.joint.set_drive_property(FINGER_STIFFNESS, FINGER_DAMPING)
     make_weightless(link, FINGER_MASS)
     return link
+
+
+def set_finger_pace(fingers: tuple[Link, Link], pace: float) -> None:
+    """See `Gripper.set_pace`."""
+    for link in fingers:
+        link.joint.set_drive_property(FINGER_STIFFNESS, FINGER_DAMPING / pace)
 
 
 def make_weightless(link: Link, mass: float) -> None:

@@ -6,7 +6,17 @@ The reference fidelity uses it, and so does the published protocol against which
 import numpy as np
 
 from collector.engine import Assembly, Link, physx, pose, sapien
-from collector.gripper import ALONG, ARM_DAMPING, ARM_STIFFNESS, HAND_MASS, add_fingers, frame, make_weightless, palm
+from collector.gripper import (
+    ALONG,
+    ARM_DAMPING,
+    ARM_STIFFNESS,
+    HAND_MASS,
+    add_fingers,
+    frame,
+    make_weightless,
+    palm,
+    set_finger_pace,
+)
 from shared.vocabulary import Float
 
 CARRIER_MASS = 0.1
@@ -30,6 +40,12 @@ class JointedGripper:
         self.joints = tuple(articulation.active_joints)
         self.palm, self.fingers = palm, fingers
         assert [j.name for j in self.joints[6:]] == ["finger-left", "finger-right"], "joint order is by creation"
+
+    def set_pace(self, pace: float) -> None:
+        """See `Gripper.set_pace`."""
+        for joint in self.joints[:6]:
+            joint.set_drive_property(ARM_STIFFNESS, ARM_DAMPING / pace)
+        set_finger_pace(self.fingers, pace)
 
     def place(self, rotation: Float, position: Float, opening: float) -> None:
         """See `Gripper.place`."""
@@ -78,7 +94,7 @@ class JointedGripper:
 
 
 def add_jointed_gripper(scene: sapien.Scene, material: physx.PhysxMaterial) -> JointedGripper:
-    """Build the published hand into a scene, weightless, as the published gravity compensation makes it."""
+    """Build the published hand into a scene; see `collector.gripper.add_gripper`."""
     assembly = Assembly(material)
     link = assembly.add(None, "hand-root", ())
     make_weightless(link, CARRIER_MASS)
@@ -96,7 +112,6 @@ def add_jointed_gripper(scene: sapien.Scene, material: physx.PhysxMaterial) -> J
                 limits=(-10.0, 10.0),
                 touches_own_kind=False,
             )
-            link.joint.set_drive_property(ARM_STIFFNESS, ARM_DAMPING)
             make_weightless(link, HAND_MASS if is_palm else CARRIER_MASS)
     fingers = add_fingers(assembly, link)
     return JointedGripper(assembly.finish(scene), link, fingers)

@@ -96,6 +96,7 @@ class Trial:
         self.steps = 0
         self._checked = False
         self._brushed = False
+        self._timing = fidelity.approach
         self._clearance = 0.0
         self._positions = np.full(1, np.nan)
         self._hand_at = np.zeros(3)
@@ -145,14 +146,16 @@ class Trial:
             if self._opening <= GRASP_OPENING:
                 raise _TrialEndedError(OutcomeKind.NO_GRASP)
         if path.then is not None:
+            self._timing = self.fidelity.drag
+            self.scene.set_timing(self._timing)
             self._leg(path.then)
             self._hold(last=True)
 
     def _leg(self, end: Float) -> None:
         """Drive the hand along a straight line to `end`, [3], hand frame, at constant speed."""
-        gripper, steps = self.scene.gripper, self.fidelity.leg_steps
+        gripper, steps = self.scene.gripper, self._timing.leg_steps
         path = np.linspace(self._hand_at, end, steps + 1)
-        velocity = (end - self._hand_at) * (self.fidelity.steps_per_second / steps)
+        velocity = (end - self._hand_at) * (self._timing.steps_per_second / steps)
         gripper.drive_velocity(velocity)
         step = 0
         while step < steps:
@@ -162,6 +165,7 @@ class Trial:
             if self.fidelity.skip_free_flight and (skipped := self._free_flight(path, step)):
                 step += skipped
                 gripper.shift(path[step], velocity)
+        gripper.drive(end)
         gripper.drive_velocity(np.zeros(3))
         self._hand_at = end
 
@@ -195,7 +199,7 @@ class Trial:
             last: nothing comes after this hold, so that a hand which has let go of a resting object may move on.
         """
         before = np.zeros(0)
-        for step in range(self.fidelity.hold_steps):
+        for step in range(self._timing.hold_steps):
             self._step()
             if not self.fidelity.end_holds_at_rest or step % REST_STEPS:
                 continue

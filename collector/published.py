@@ -20,7 +20,7 @@ from collector.jointed_gripper import JointedGripper
 from collector.partnet import read_object
 from collector.primitives import Trial
 from collector.scene import Scene
-from shared.configuration import FIDELITIES, StrictModel
+from shared.configuration import FIDELITIES, PUBLISHED_TIMING, StrictModel
 from shared.vocabulary import Action, Direction, Float, HiddenDynamics, OutcomeKind, Primitive
 
 STILL_STEPS, MOST_STEPS = 5000, 20_000
@@ -71,7 +71,7 @@ class PublishedTrial(Trial):
 
     def _leg(self, end: Float) -> None:
         """Drive the hand to `end`, [3], hand frame, by velocities of its joints that are computed at every step."""
-        gripper, steps, rate = _jointed(self.scene), self.fidelity.leg_steps, self.fidelity.steps_per_second
+        gripper, steps, rate = _jointed(self.scene), PUBLISHED_TIMING.leg_steps, PUBLISHED_TIMING.steps_per_second
         hand, arm = gripper.articulation, gripper.joints[:6]
         palm, model = hand.links.index(gripper.palm), hand.create_pinocchio_model()
         targets, twist = np.append(self._hand_at, np.zeros(3)), np.zeros(6)
@@ -95,7 +95,7 @@ class PublishedTrial(Trial):
         hand = gripper.articulation
         for joint in gripper.joints[:6]:
             joint.set_drive_velocity_target(0.0)
-        for _ in range(self.fidelity.hold_steps):
+        for _ in range(PUBLISHED_TIMING.hold_steps):
             hand.set_qf(hand.compute_passive_force(gravity=False, coriolis_and_centrifugal=True))
             self._step()
         hand.set_qf(np.zeros(len(gripper.joints), dtype=np.float32))
@@ -110,7 +110,7 @@ def run(request: PublishedRequest) -> PublishedTiming:
     started = time.process_time()
     fidelity = FIDELITIES["reference"]
     dynamics = HiddenDynamics(request.part_mass, request.joint_friction, request.surface_friction, request.direction)
-    scene = Scene(read_object(request.folder), dynamics, fidelity)
+    scene = Scene(read_object(request.folder), dynamics, fidelity, request.primitive)
     positions = np.array(request.joint_positions)
     scene.restrict(positions)
     scene.put(positions)

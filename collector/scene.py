@@ -12,8 +12,8 @@ from collector.articulation import ArticulatedObject, Joint
 from collector.engine import Assembly, Link, new_scene, physx, pose, sapien, set_mass
 from collector.gripper import Gripper, add_gripper
 from collector.jointed_gripper import add_jointed_gripper
-from shared.configuration import Fidelity
-from shared.vocabulary import Direction, Float, HiddenDynamics
+from shared.configuration import Fidelity, Timing
+from shared.vocabulary import Direction, Float, HiddenDynamics, Primitive
 
 RESTITUTION = 0.01
 FRICTION_DAMPING = 1e5
@@ -61,16 +61,21 @@ class Scene:
         target: the object.
         dynamics: the hidden draw, applied to every movable part.
         fidelity: time step, solver iterations, and how the hand flies.
+        primitive: what will be executed.
 
     Attributes:
         system: SAPIEN's physics system; `system.step()` advances time.
         gripper: the flying hand.
     """
 
-    def __init__(self, target: ArticulatedObject, dynamics: HiddenDynamics, fidelity: Fidelity) -> None:
+    def __init__(
+        self, target: ArticulatedObject, dynamics: HiddenDynamics, fidelity: Fidelity, primitive: Primitive
+    ) -> None:
         self.object = target
         self.dynamics = dynamics
-        self._scene, self.system = new_scene(fidelity)
+        pushes = primitive is Primitive.PUSH
+        iterations = fidelity.push_solver_iterations if pushes else fidelity.solver_iterations
+        self._scene, self.system = new_scene(iterations)
         material = physx.PhysxMaterial(dynamics.surface_friction, dynamics.surface_friction, RESTITUTION)
         self._articulation, self._links = _add_object(self._scene, target, material)
         joints = {joint.name: joint for joint in self._articulation.active_joints}
@@ -84,12 +89,20 @@ class Scene:
         add_hand = add_jointed_gripper if fidelity.jointed_hand else add_gripper
         self.gripper: Gripper = add_hand(self._scene, material)
         self._hand = {self.gripper.palm, *self.gripper.fingers}
-        self._impulse_squared = (CONTACT_FORCE / fidelity.steps_per_second) ** 2
+        self._fidelity = fidelity
+        self._impulse_squared = 0.0
         self.limits = target.limits()
         self.park()
 
+    def set_timing(self, timing: Timing) -> None:
+        """Step time, and move the hand, as `timing` says from now on."""
+        self.system.set_timestep(1.0 / timing.steps_per_second)
+        self._impulse_squared = (CONTACT_FORCE / timing.steps_per_second) ** 2
+        self.gripper.set_pace(timing.pace)
+
     def park(self) -> None:
-        """Take the hand out of reach."""
+        """Take the hand out of reach, and step time as before any trial."""
+        self.set_timing(self._fidelity.approach)
         self.gripper.place(np.eye(3), PARKED, 0.0)
 
     def joint_positions(self) -> Float:

@@ -14,9 +14,9 @@ import numpy as np
 import psutil
 
 from collector.articulation import ArticulatedObject
-from collector.catalogue import load_ref
 from collector.clock import StageClock
 from collector.draws import object_of
+from collector.object_cache import ObjectCache
 from collector.guard import UnderWay
 from collector.proposers import RandomProposer
 from collector.rollout import quarantined_rollout, run_rollout
@@ -31,7 +31,6 @@ from shared.store.layout import MAX_REASON
 from shared.vocabulary import Proposer
 
 NOTHING: Mapping[int, str] = MappingProxyType({})
-CACHED_OBJECTS = 16
 CACHED_POLICIES = 2
 """An evaluation may go back and forth between the last policy and the first."""
 
@@ -72,7 +71,7 @@ class Worker:
     def __init__(self, store: str | Path, objects: Path) -> None:
         self._store = Store.open(store)
         self._folder = objects
-        self._objects: dict[str, ArticulatedObject] = {}
+        self._objects = ObjectCache(objects)
         self._adapters: dict[int, Adapter] = {}
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
@@ -131,18 +130,13 @@ class Worker:
 
     def _load(self, plan: Plan, index: int, clock: StageClock) -> ArticulatedObject:
         """The object of a rollout, as the plan knows it."""
-        ref = object_of(plan, index)
-        if ref.id not in self._objects:
-            if len(self._objects) >= CACHED_OBJECTS:
-                self._objects.pop(next(iter(self._objects)))
-            with clock.stage("load"):
-                self._objects[ref.id] = load_ref(self._folder, ref, plan.setting.collection.collision)
-        return self._objects[ref.id]
+        with clock.stage("load"):
+            return self._objects.load(object_of(plan, index), plan.setting.collection.collision)
 
     def _proposer(self, plan: Plan, name: str, rng: np.random.Generator, version: int) -> Proposer:
         """The proposer called `name`, of a policy version."""
         if name == RandomProposer.name:
-            return RandomProposer(rng)
+            return RandomProposer(rng, plan.setting.terms.edge_share)
         if version not in self._adapters:
             self.load_policy(version, self._store.read_policy(version))
         return proposer_named(name, self._adapters[version], rng, plan.most_tries)

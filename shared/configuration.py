@@ -62,18 +62,43 @@ class CameraConfig(StrictModel):
         return self
 
 
+PUBLISHED_LEG_S = 4.0
+"""How long one leg of a primitive takes as published: 2,000 steps of 1/500 s."""
+
+
+class Timing(StrictModel):
+    """How finely one part of a trial is stepped, and how fast the hand moves in it."""
+
+    steps_per_second: int = Field(ge=60, le=2000)
+    leg_steps: int = Field(ge=1)
+    """Steps of one leg of a primitive."""
+    hold_steps: int = Field(ge=0)
+    """Steps of hold after a leg, at the most."""
+
+    @property
+    def pace(self) -> float:
+        """How many times faster than published the hand moves."""
+        return PUBLISHED_LEG_S * self.steps_per_second / self.leg_steps
+
+
+PUBLISHED_TIMING = Timing(steps_per_second=500, leg_steps=2000, hold_steps=2000)
+
+
 class Fidelity(StrictModel):
     """How finely a trial is simulated; `fast` agrees with `reference`, the published timing, on labels."""
 
     name: str = "fast"
-    steps_per_second: int = Field(240, ge=60, le=2000)
-    leg_steps: int = Field(480, ge=1)
-    """Steps of one leg of a primitive."""
-    hold_steps: int = Field(240, ge=0)
-    """Steps of hold after a leg."""
-    solver_iterations: int = Field(10, ge=1, le=255)
+    approach: Timing = Timing(steps_per_second=240, leg_steps=240, hold_steps=240)
+    """Until the fingers have closed. The dampers of the hand's drives are weaker by as much as it is faster, so that
+    its forces stay as published."""
+    drag: Timing = Timing(steps_per_second=240, leg_steps=480, hold_steps=480)
+    """The second leg of every primitive but push: whether what is pinched or dragged slips hangs on its speed."""
+    push_solver_iterations: int = Field(10, ge=1, le=255)
+    """Of the engine, for pushes."""
+    solver_iterations: int = Field(20, ge=1, le=255)
+    """For all other primitives, since friction between fingers and part needs more."""
     skip_free_flight: bool = True
-    """Begin an approach where the hand comes within a millimetre of the object, instead of where it starts."""
+    """Move the hand at once to within a third of a millimetre of the object, while nothing touches it."""
     end_holds_at_rest: bool = True
     """End a hold once neither hand nor object moves."""
     jointed_hand: bool = False
@@ -84,10 +109,9 @@ FIDELITIES = {
     "fast": Fidelity(),
     "reference": Fidelity(
         name="reference",
-        steps_per_second=500,
-        leg_steps=2000,
-        hold_steps=2000,
-        solver_iterations=20,
+        approach=PUBLISHED_TIMING,
+        drag=PUBLISHED_TIMING,
+        push_solver_iterations=20,
         skip_free_flight=False,
         end_holds_at_rest=False,
         jointed_hand=True,

@@ -14,12 +14,13 @@ from cluster.benchmarks.results import as_line, keep
 from cluster.cli import run
 from collector.catalogue import scan
 from collector.procedural import generate
-from shared.configuration import CameraConfig, CollectionConfig, Fidelity
+from shared.configuration import CameraConfig, CollectionConfig, Fidelity, Timing
 from shared.errors import UsageError
 from shared.plan import Plan, Setting
 from shared.vocabulary import Outcome, OutcomeKind
 
-COARSE = Fidelity(name="coarse", steps_per_second=120, leg_steps=60, hold_steps=30)
+HASTE = Timing(steps_per_second=120, leg_steps=60, hold_steps=30)
+COARSE = Fidelity(name="coarse", approach=HASTE, drag=HASTE)
 COARSE_FLAGS = [
     f"--reference.{name.replace('_', '-')}={value}" for name, value in COARSE.model_dump().items() if type(value) is int
 ]

@@ -20,7 +20,7 @@ INTO = gripper_rotation(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
 
 
 def scene_of(target: ArticulatedObject) -> Scene:
-    scene = Scene(target, EASY, FIDELITY)
+    scene = Scene(target, EASY, FIDELITY, Primitive.PULL)
     scene.put(np.zeros(1))
     return scene
 

@@ -133,7 +133,7 @@ def test_a_row_is_enough_to_replay_its_interaction(objects: Path) -> None:
         record = rollout(plan, objects, index)
         target = load_ref(objects, record.object)
         for row in record.interactions:
-            scene = Scene(target, record.dynamics, plan.setting.collection.fidelity)
+            scene = Scene(target, record.dynamics, plan.setting.collection.fidelity, row.primitive)
             scene.put(row.joint_positions)
             again = Trial(scene, row.action, row.target_part, row.primitive, plan.setting.collection.fidelity).run()
             assert again.kind is row.outcome.kind

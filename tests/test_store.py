@@ -263,12 +263,12 @@ def test_the_store_opens_again_and_knows_its_setting(tmp_path: Path) -> None:
 
 def test_another_setting_is_refused_with_the_difference(tmp_path: Path) -> None:
     Store.create(tmp_path, SETTING)
-    fine = CollectionConfig(camera=SETTING.collection.camera, fidelity=Fidelity(leg_steps=100))
+    fine = CollectionConfig(camera=SETTING.collection.camera, fidelity=Fidelity(push_solver_iterations=12))
     changes = {
         "task: the store has push, given pull": {"task": "pull"},
         "objects: the store has 3 entries, given 2": {"objects": SETTING.objects[:2]},
         r"objects\[0\].id: the store has object-0, given object-2 \(and 3 more\)": {"objects": SETTING.objects[::-1]},
-        "collection.fidelity.leg_steps: the store has 480, given 100": {"collection": fine},
+        "collection.fidelity.push_solver_iterations: the store has 10, given 12": {"collection": fine},
     }
     for message, change in changes.items():
         with pytest.raises(StoreError, match=message) as caught:
