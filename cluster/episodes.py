@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -13,8 +14,10 @@ from shared.vocabulary import Interaction, Observation, Role
 
 TOLD: MethodName = "ours-final"
 """The method whose episodes pictures show."""
+MOST_EPISODES = 60
+"""Looked at for pictures, at the most: each holds all clouds of its rollout, some megabytes."""
 CANDIDATES = 40
-"""Episodes looked at, at the most, for the one that shows the most."""
+"""Episodes among them that are asked for what their tries changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +48,12 @@ class Episode:
         return self.history[: exploit.budget]
 
 
-def episodes(evaluation: Store, method: MethodName = TOLD) -> Iterator[Episode]:
+def first_episodes(evaluation: Store, most: int = MOST_EPISODES) -> list[Episode]:
+    """The first episodes of the method that pictures show; raises as `episodes` does."""
+    return list(islice(episodes(evaluation, TOLD), most))
+
+
+def episodes(evaluation: Store, method: MethodName) -> Iterator[Episode]:
     """The episodes of a method that tried anything, in order.
 
     Raises:

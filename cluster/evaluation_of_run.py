@@ -48,7 +48,7 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
             queries=settings.queries,
         ),
     )
-    out = out if out is not None else run.path / "evaluations" / _name(setting, folder, version)
+    out = out if out is not None else run.evaluations / _name(setting, folder, version)
     evaluation = Evaluation(
         store=Store.create(out / "store", setting),
         policies=policies,

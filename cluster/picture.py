@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from cluster.episodes import episodes, most_telling
+from cluster.episodes import first_episodes, most_telling
 from shared.adaptation import Adapter
 from shared.policy import Policy
 from shared.store import Store
@@ -31,7 +31,7 @@ def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
         Whether there was any rollout to draw; if not, no file is written.
     """
     adapter = Adapter(policy)
-    episode = most_telling(list(episodes(evaluation)), adapter)
+    episode = most_telling(first_episodes(evaluation), adapter)
     if episode is None:
         return False
     chosen, history = episode.rollout, episode.history
@@ -45,6 +45,7 @@ def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
         f"(hidden: mass {dynamics.part_mass:.2f}, joint friction {dynamics.joint_friction:.2f}, "
         f"surface friction {dynamics.surface_friction:.2f}, {dynamics.direction.value})",
         fontsize=9,
+        parse_math=False,
     )
     observations = [history[0].observation, *(interaction.observation for interaction in history)]
     heat = [adapter.affordance(observation, history[:count]) for count, observation in enumerate(observations)]

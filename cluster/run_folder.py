@@ -106,6 +106,11 @@ class RunFolder:
         """What all training stages leave."""
         return self.path / "training"
 
+    @property
+    def evaluations(self) -> Path:
+        """What `adaafford evaluate` leaves, a folder each."""
+        return self.path / "evaluations"
+
     def objects_used(self) -> ObjectsUsed:
         """What objects.json says."""
         return parse(ObjectsUsed, read_json(self.objects_file), str(self.objects_file))

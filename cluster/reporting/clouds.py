@@ -23,8 +23,8 @@ HEAD = 0.3
 """Of an arrow's head, as a share of its length."""
 BODY_COLOUR = "#c9ced4"
 COLOURS = "Viridis"
-EYE = 1.3
-"""Distance of the eye from the middle of a cloud whose longest side is 1."""
+TANGENT, PANEL_WIDTH = 0.414, 0.8
+"""Of half plotly's vertical field of view, 45 deg; and how wide a panel is at the least, in heights."""
 PANEL_HEIGHT = 330
 
 
@@ -156,8 +156,7 @@ def _frame(panels: Sequence[Panel]) -> dict[str, Any]:
     size = np.maximum(high - low, 1e-3)
     axis = {"visible": False, "showspikes": False}
     ratio = dict(zip("xyz", (size / size.max()).tolist(), strict=True))
-    camera = panels[0].observation.world_from_camera[:3, 3]
-    eye = EYE * camera / np.linalg.norm(camera)
+    eye = _eye((everything - (low + high) / 2) / size.max(), panels[0].observation.world_from_camera)
     ranges = {
         f"{name}axis": {**axis, "range": [float(a), float(b)]} for name, a, b in zip("xyz", low, high, strict=True)
     }
@@ -168,6 +167,14 @@ def _frame(panels: Sequence[Panel]) -> dict[str, Any]:
         "dragmode": "orbit",
         "camera": {"eye": dict(zip("xyz", eye.tolist(), strict=True)), "up": {"x": 0, "y": 0, "z": 1}},
     }
+
+
+def _eye(points: Float, world_from_camera: Float) -> Float:
+    """Where the eye stands, [3]: in the direction of the camera, as near as shows all points, [N, 3]."""
+    forward, left, up = world_from_camera[:3, :3].T
+    reach = np.maximum(np.abs(points @ left) / PANEL_WIDTH, np.abs(points @ up)) / TANGENT
+    eye: Float = -forward * float((reach - points @ forward).max())
+    return eye
 
 
 def _ends(arrow: Arrow) -> Float:

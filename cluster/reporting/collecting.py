@@ -1,12 +1,14 @@
 """What was collected: base rates, how trials ended, what proposed them, where the time went, what was given up."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
+from cluster.ledger import Ledger
 from cluster.reporting.page import Cell, Drawing, Section, Table, plain, shortened
 from cluster.reporting.style import ACCENT, SECOND, laid_out
 from shared.store import Store
@@ -20,12 +22,13 @@ CONFIDENCE_Z = 1.96
 Summary = Mapping[str, Any]
 
 
-def collection_section(summary: Summary, store: Store) -> Section:
+def collection_section(summary: Summary, store: Store, ledger: Ledger) -> Section:
     """The statistics of a run's collection.
 
     Args:
         summary: what summary.json says.
         store: the interactions.
+        ledger: of the run.
 
     Raises:
         StoreError: a manifest is damaged or foreign.
@@ -44,8 +47,8 @@ def collection_section(summary: Summary, store: Store) -> Section:
     tables = [_quarantine(quarantined)] if quarantined else []
     if objects["refused"]:
         tables.append(_refused(objects["refused"]))
-    drawings = (_rates(summary), _outcomes(summary), _seconds(summary))
-    return Section("collection", "Collection", lead, tuple(tables), drawings)
+    drawings = (_rates(summary), _outcomes(summary), _seconds(summary, worker_seconds(ledger)))
+    return Section("collection", "Collection", lead, tables=tuple(tables), drawings=drawings)
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
@@ -55,7 +58,18 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     z2, share = CONFIDENCE_Z**2, successes / count
     middle = (share + z2 / (2 * count)) / (1 + z2 / count)
     half = CONFIDENCE_Z / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    # At shares of 0 and 1 the limits are these very numbers, but for rounding.
+    return max(0.0, min(middle - half, share)), min(1.0, max(middle + half, share))
+
+
+def worker_seconds(ledger: Ledger) -> dict[str, float]:
+    """What workers spent their time on over all collection rounds, as far as rounds noted it."""
+    spent: Counter[str] = Counter()
+    for name in ledger.finished:
+        if name.startswith("collect-"):
+            spent.update(ledger.result(name)["tally"]["seconds"])
+    spent.pop("total", None)
+    return dict(spent)
 
 
 def _rates(summary: Summary) -> Drawing:
@@ -136,24 +150,32 @@ def _outcomes(summary: Summary) -> Drawing:
     )
 
 
-def _seconds(summary: Summary) -> Drawing:
+def _seconds(summary: Summary, workers: Mapping[str, float]) -> Drawing:
     """Where the wall time went."""
-    stages = list(summary["stage_seconds"].items())[::-1]
-    figure = go.Figure(
-        go.Bar(
-            y=[plain(name) for name, _ in stages],
-            x=[seconds for _, seconds in stages],
-            orientation="h",
-            marker={"color": [ACCENT if name.startswith("train") else SECOND for name, _ in stages]},
-            text=[f"{seconds:,.0f} s" for _, seconds in stages],
-            textposition="outside",
-            cliponaxis=False,
-            hovertemplate="%{x:,.1f} s<extra></extra>",
-        )
+    stages = summary["stage_seconds"]
+    figure = make_subplots(
+        1, 2, subplot_titles=["wall time by stage (s)", "time of workers while collecting (s)"], horizontal_spacing=0.2
     )
-    figure.update_xaxes(title_text="wall time (s)", rangemode="tozero")
-    laid_out(figure, 110 + BAR_HEIGHT * max(len(stages), 2), bargap=0.3, margin={"l": 60, "r": 70, "t": 20, "b": 50})
-    return Drawing(figure, f"Seconds by stage, {summary['wall_seconds']:,.0f} in all; training in red.")
+    for column, spent in enumerate((stages, workers), start=1):
+        names = list(spent)[::-1]
+        figure.add_trace(
+            go.Bar(
+                y=[plain(name) for name in names],
+                x=[spent[name] for name in names],
+                orientation="h",
+                marker={"color": [ACCENT if name.startswith("train") else SECOND for name in names]},
+                text=[f"{spent[name]:,.0f}" for name in names],
+                textposition="outside",
+                cliponaxis=False,
+                hovertemplate="%{x:,.1f} s<extra></extra>",
+            ),
+            1,
+            column,
+        )
+    figure.update_xaxes(rangemode="tozero")
+    bars = max(len(stages), len(workers), 2)
+    laid_out(figure, 110 + BAR_HEIGHT * bars, showlegend=False, bargap=0.3, margin={"l": 60, "r": 60, "t": 40, "b": 40})
+    return Drawing(figure, f"{summary['wall_seconds']:,.0f} s in all; training in red.")
 
 
 def _quarantine(quarantined: Sequence[Quarantined]) -> Table:

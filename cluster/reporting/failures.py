@@ -31,7 +31,7 @@ def failures_section(episodes: Sequence[Episode], adapter: Adapter) -> Section:
     key, title = "failures", "Failure gallery"
     last = [(episode, episode.exploits[-1]) for episode in episodes if episode.exploits]
     failed = [(episode, row) for episode, row in last if not row.outcome.success]
-    counted = f"{len(failed)} of {len(last)} exploits at the greatest budget failed."
+    counted = f"{len(failed)} of the {len(last)} exploits that were looked at, at the greatest budget, failed."
     if not failed:
         return Section(key, title, (counted if last else "Nothing was exploited.",))
     chosen = varied([_believed(episode, row, adapter) for episode, row in failed[:LOOKED_AT]])

@@ -226,8 +226,8 @@ def hidden_facts_section(
         f"{target.ref.category} {target.ref.id}, not seen in training"
         + (" (for the hinge's side: one cabinet, hung on its left and on its right)" if twins else "")
         + f". Under each value the same {TRIES} actions were tried (green: success, red: failure); all other hidden "
-        "facts stay at the middle of their range. Every cloud of a row looks the same to the camera, so that what differs in "
-        "colour was learnt from the tries. Drag a cloud to turn all.",
+        "facts stay at the middle of their range. Every cloud of a row looks the same to the camera, so that what "
+        "differs in colour was learnt from the tries. Drag a cloud to turn all.",
     )
     return Section(key, title, lead, drawings=tuple(drawings))
 

@@ -65,6 +65,24 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture.
+
+    Attributes:
+        png: its bytes.
+        caption: what it shows.
+    """
+
+    png: bytes
+    caption: str
+
+    @property
+    def url(self) -> str:
+        """The picture within the page."""
+        return f"data:image/png;base64,{base64.b64encode(self.png).decode()}"
+
+
+@dataclass(frozen=True, slots=True)
 class Drawing:
     """A plotly figure.
 
@@ -73,31 +91,22 @@ class Drawing:
         caption: what it shows.
         tab: what the button that shows it says; drawings of a section that have one share a place.
         solid: whether it is in three dimensions: it takes graphics memory while it is in view.
-        picture: instead of a figure, the bytes of a PNG.
     """
 
-    figure: go.Figure | None
+    figure: go.Figure
     caption: str = ""
     tab: str = ""
     solid: bool = False
-    picture: bytes = b""
 
     @property
     def json(self) -> str:
         """The figure for a script element: JSON without any character that HTML could mistake."""
-        assert self.figure is not None
         text = str(self.figure.to_json())
         return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
     @property
-    def picture_url(self) -> str:
-        """The picture within the page."""
-        return f"data:image/png;base64,{base64.b64encode(self.picture).decode()}"
-
-    @property
     def height(self) -> int:
         """Of the figure, pixels."""
-        assert self.figure is not None
         return int(self.figure.layout.height)
 
 
@@ -109,13 +118,15 @@ class Section:
         key: its anchor: letters and hyphens.
         title: its heading.
         lead: paragraphs that come first.
-        tables: its tables.
+        pictures: its pictures.
+        tables: its tables; those that are folded come last.
         drawings: its figures.
     """
 
     key: str
     title: str
     lead: tuple[str, ...] = ()
+    pictures: tuple[Picture, ...] = ()
     tables: tuple[Table, ...] = ()
     drawings: tuple[Drawing, ...] = ()
 
@@ -147,8 +158,7 @@ def render(page: Page) -> str:
         lstrip_blocks=True,
     )
     own, library = _asset("report.js"), get_plotlyjs()
-    if "</script" in library.lower():
-        raise AssertionError("plotly.js must not end its own script element")
+    assert "</script" not in library.lower(), "plotly.js does not end its own script element"
     policy = (
         "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
         f"script-src {_hash(library)} {_hash(own)}"

@@ -23,8 +23,8 @@ def proposals_section(episode: Episode | None, adapter: Adapter) -> Section:
         f"{rollout.object.category} {rollout.object.id}, not seen in training; hidden: {hidden(rollout.dynamics)}. Of "
         "the evaluation, the object whose affordance the tries changed the most.",
         "Above: where AIP expects a try to tell most, from the least to the most of each cloud, and what it proposes "
-        "there (black). Below: the affordance after that many tries, with the last of them (green: success, red: failure). "
-        "Static parts are grey. Drag a cloud to turn all.",
+        "there (black). Below: the affordance after that many tries, with the last of them (green: success, red: "
+        "failure). Static parts are grey. Drag a cloud to turn all.",
     )
     return Section(key, title, lead, drawings=(Drawing(_figure(history, adapter), solid=True),))
 
@@ -55,7 +55,7 @@ def _figure(history: list[Interaction], adapter: Adapter) -> go.Figure:
         before = history[:count]
         arrows = (proposed(history[count].action),) if count < len(history) else ()
         values = information(observation, before, adapter)
-        title = f"AIP, {_tries(count)}: at most {values.max():.2g}"
+        title = f"AIP, {_tries(count)}: at most {values[observation.movable].max():.2g}"
         title += f"<br>proposes try {count + 1}" if arrows else "<br>&nbsp;"
         above.append(Panel(title, observation, _stretched(values, observation), arrows))
         shown = observations[count - 1] if count else observation

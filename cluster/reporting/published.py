@@ -5,6 +5,7 @@ Objects, physics and random draws differ, so the absolute figures are marks and 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 from shared.methods import MethodName
 
@@ -18,14 +19,12 @@ class Published:
     f_score: tuple[float, ...]
     sample_success: tuple[float, ...]
 
-    def at(self, budget: int) -> tuple[float, float] | None:
-        """F-score and sample-success after a budget of tries; None where the paper has none."""
-        if len(self.f_score) == 1:
-            return self.f_score[0], self.sample_success[0]
-        if budget not in BUDGETS:
-            return None
-        place = BUDGETS.index(budget)
-        return self.f_score[place], self.sample_success[place]
+    def at(self, budget: int, measure: Literal["f_score", "sample_success"]) -> float | None:
+        """The figure after a budget of tries; None where the paper has none."""
+        figures = self.f_score if measure == "f_score" else self.sample_success
+        if len(figures) == 1:
+            return figures[0]
+        return figures[BUDGETS.index(budget)] if budget in BUDGETS else None
 
 
 _PUSH_TRAIN: dict[MethodName, Published] = {

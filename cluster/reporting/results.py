@@ -1,83 +1,162 @@
 """What each method knows and does after each budget of tries: the table, the adaptation curves, the first figures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Literal
 
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
+from pydantic import BaseModel, ConfigDict, Field
 
-from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain
+from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
 from cluster.reporting.published import published
 from cluster.reporting.style import COLOURS, SOFT, laid_out
+from cluster.run_folder import read_json
 from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
+from shared.configuration import parse
 from shared.methods import METHODS
 
-Figures = Mapping[str, Any]
-"""A row of summary.json: a method after a budget."""
+Measure = Literal["f_score", "sample_success"]
+MEASURES: tuple[tuple[Measure, str], ...] = (("f_score", "F-score"), ("sample_success", "sample-success"))
+"""What is compared, and what people call it; in percent on the page."""
 WITHOUT_TRIES = (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD)
 BEST_METHOD = "ours-final"
-MEASURES = (("f_score", "F-score"), ("sample_success", "sample-success"))
-"""Key in a row, and what people call it; both in percent on the page."""
+
+
+class ResultRow(BaseModel):
+    """A row of results.json: a method after a budget. See `learner.evaluation.EvaluationRow`."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    method: str = Field(max_length=100)
+    budget: int
+    f_score: float | None
+    f_score_low: float | None = None
+    f_score_high: float | None = None
+    sample_success: float | None
+    sample_success_low: float | None = None
+    sample_success_high: float | None = None
+    trials: int
+    gap_closed: float | None = None
+    best_f: float | None
+    bce: float | None
+    auc: float | None
+    base_rate: float | None
+    queries: int
+    mean_tries: float | None
+
+    def value(self, measure: Measure) -> float | None:
+        """One of the measures."""
+        return self.f_score if measure == "f_score" else self.sample_success
+
+    def interval(self, measure: Measure) -> tuple[float, float] | None:
+        """The limits of its 95% interval; None where it has none."""
+        if measure == "f_score":
+            low, high = self.f_score_low, self.f_score_high
+        else:
+            low, high = self.sample_success_low, self.sample_success_high
+        return None if low is None or high is None else (low, high)
+
+
+class ResultRows(BaseModel):
+    """What is read of results.json."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    task: str = Field("", max_length=100)
+    rows: tuple[ResultRow, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """The results of a run.
+    """The results of one evaluation.
 
     Attributes:
         task: what was evaluated.
-        rows: of summary.json.
+        rows: a method and a budget each.
         novel_categories: whether the test objects are of categories that nothing was trained on.
     """
 
     task: str
-    rows: Sequence[Figures]
+    rows: tuple[ResultRow, ...]
     novel_categories: bool = False
 
     @property
     def budgets(self) -> list[int]:
         """Numbers of tries, ascending."""
-        return sorted({row["budget"] for row in self.rows if row["budget"] > 0})
+        return sorted({row.budget for row in self.rows if row.budget > 0})
 
     @property
     def methods(self) -> list[str]:
         """In the order of the paper's table, and then what stands beside them."""
         order = [*METHODS, NO_TRIES_METHOD, ORACLE_METHOD]
-        found = {row["method"] for row in self.rows}
+        found = {row.method for row in self.rows}
         return [name for name in order if name in found] + sorted(found - set(order))
 
-    def row(self, method: str, budget: int) -> Figures | None:
-        """The row of a method at a budget; of those that try nothing, their only one will do."""
-        own = [row for row in self.rows if row["method"] == method]
-        exact = [row for row in own if row["budget"] == budget]
-        if exact or method not in WITHOUT_TRIES or not own:
-            return exact[0] if exact else None
-        return own[0]
+    @property
+    def has_paper(self) -> bool:
+        """Whether the paper has figures for the task."""
+        return bool(published(self.task, novel_categories=self.novel_categories))
 
-    def of_paper(self, method: str, budget: int, measure: str) -> float | None:
-        """The paper's own figure, percent; of methods in one shot only where we have a row as well."""
+    def row(self, method: str, budget: int) -> ResultRow | None:
+        """The row of a method at a budget; of those that try nothing, their only one will do."""
+        own = [row for row in self.rows if row.method == method]
+        exact = next((row for row in own if row.budget == budget), None)
+        return own[0] if exact is None and own and method in WITHOUT_TRIES else exact
+
+    def of_paper(self, method: str, budget: int, measure: Measure) -> float | None:
+        """The paper's own figure, percent, where we have a row as well."""
         told = {str(name): each for name, each in published(self.task, novel_categories=self.novel_categories).items()}
         if method not in told or self.row(method, budget) is None:
             return None
-        pair = told[method].at(budget)
-        return None if pair is None else pair[measure == "sample_success"]
+        return told[method].at(budget, measure)
+
+    def best(self, measure: Measure, budget: int) -> float | None:
+        """The highest figure of a column, the oracle's left out."""
+        rows = [self.row(method, budget) for method in self.methods if method != ORACLE_METHOD]
+        return max((value for row in rows if row and (value := row.value(measure)) is not None), default=None)
+
+
+def read_results(path: Path, task: str = "", *, novel_categories: bool = False) -> Results:
+    """The results in a file that an evaluation wrote.
+
+    Args:
+        path: results.json.
+        task: what was evaluated, where the file does not say so itself.
+        novel_categories: see `Results`.
+
+    Raises:
+        StoreError: the file is missing or no JSON.
+        UsageError: it does not hold results.
+    """
+    read = parse(ResultRows, read_json(path), str(path))
+    return Results(read.task or task, read.rows, novel_categories)
 
 
 def results_section(results: Results) -> Section:
-    """The table and the curves."""
+    """The table and the curves of the run's own evaluation."""
     lead: tuple[str, ...] = (
         "F-score: whether the critic tells, at the threshold 0.5, which random interactions with unseen objects "
-        "succeed. Sample-success: whether what the adapted affordance chooses succeeds when it is executed. In percent; "
-        "the small figures are the limits of the 95% interval over objects. Bold: the best of a column, the oracle left "
-        "out, which is told the hidden facts.",
+        "succeed. Sample-success: whether what the adapted affordance chooses succeeds when it is executed. In "
+        "percent; the small figures are the limits of the 95% interval over objects. Bold: the best of a column, the "
+        "oracle left out, which is told the hidden facts.",
     )
-    if published(results.task, novel_categories=results.novel_categories):
+    if results.has_paper:
         lead += (
             "In italics: the paper's own figures. Its objects, physics and random draws were others, so that orders "
             "and trends can be compared, but not single figures.",
         )
-    return Section("results", "Methods and budgets", lead, (_table(results), _details(results)), (_curves(results),))
+    tables = (table_of(results), details_of(results))
+    return Section("results", "Methods and budgets", lead, tables=tables, drawings=(_curves(results),))
+
+
+def further_section(evaluations: Sequence[tuple[str, Results]]) -> Section:
+    """Tables of evaluations on other objects, by their names."""
+    tables = [table_of(results, f"{shortened(name)}: {shortened(results.task)}") for name, results in evaluations]
+    return Section(
+        "further", "Further evaluations", ("Of the same policy, by `adaafford evaluate`.",), tables=tuple(tables)
+    )
 
 
 def tiles(results: Results) -> tuple[Tile, ...]:
@@ -85,91 +164,72 @@ def tiles(results: Results) -> tuple[Tile, ...]:
     if not results.budgets:
         return ()
     budget = results.budgets[-1]
-    rows = {name: results.row(name, budget) for name in (PRIOR_METHOD, BEST_METHOD, ORACLE_METHOD)}
-    made, prior, oracle = rows[BEST_METHOD], rows[PRIOR_METHOD], rows[ORACLE_METHOD]
+    made, prior = results.row(BEST_METHOD, budget), results.row(PRIOR_METHOD, budget)
     shown = []
     if made is not None:
         after = f"after {budget} tries" if budget != 1 else "after one try"
-        shown.append(Tile(_percent(made["f_score"]), f"F-score of {BEST_METHOD} {after}"))
-        shown.append(Tile(_percent(made["sample_success"]), f"sample-success of {BEST_METHOD} {after}"))
+        shown.append(Tile(_percent(made.f_score), f"F-score of {BEST_METHOD} {after}"))
+        shown.append(Tile(_percent(made.sample_success), f"sample-success of {BEST_METHOD} {after}"))
     if prior is not None:
-        without = f"{_percent(prior['f_score'])} / {_percent(prior['sample_success'])}"
+        without = f"{_percent(prior.f_score)} / {_percent(prior.sample_success)}"
         shown.append(Tile(without, f"F-score / sample-success of {PRIOR_METHOD}, which tries nothing"))
-    closed = _closed(prior, made, oracle)
-    if closed is not None:
-        shown.append(Tile(f"{100 * closed:.0f}%", "of the gap in cross entropy between it and the oracle closed"))
+    if made is not None and made.gap_closed is not None:
+        label = f"of the gap in F-score between {PRIOR_METHOD} and the oracle closed"
+        shown.append(Tile(f"{100 * made.gap_closed:.0f}%", label))
     return tuple(shown)
 
 
-def _closed(prior: Figures | None, made: Figures | None, oracle: Figures | None) -> float | None:
-    """The share of the gap in cross entropy that is closed; None where something is missing or there is no gap."""
-    if prior is None or made is None or oracle is None:
-        return None
-    gap = prior["bce"] - oracle["bce"]
-    return (prior["bce"] - made["bce"]) / gap if gap > 0 else None
-
-
-def _table(results: Results) -> Table:
-    budgets = results.budgets
-    has_paper = bool(published(results.task, novel_categories=results.novel_categories))
-    columns = [(measure, budget) for measure, _ in MEASURES for budget in budgets]
-    width = 2 if has_paper else 1
-    first: Row = (Cell("method", kind="name"), *(Cell(name, span=width * len(budgets)) for _, name in MEASURES))
+def table_of(results: Results, caption: str = "") -> Table:
+    """Methods by budgets, beside the paper's."""
+    columns = [(measure, budget) for measure, _ in MEASURES for budget in results.budgets]
+    width = (2 if results.has_paper else 1) * len(results.budgets)
     second: Row = (Cell("tries", kind="name"),)
     for _, budget in columns:
-        second += (Cell(str(budget)),) + ((Cell("paper", kind="paper"),) if has_paper else ())
-    best = {column: _best(results, *column) for column in columns}
+        second += (Cell(str(budget)), *([Cell("paper", kind="paper")] if results.has_paper else []))
     body = []
     for method in results.methods:
         cells: Row = (Cell(method, kind="name"),)
         for measure, budget in columns:
-            to_beat = None if method == ORACLE_METHOD else best[measure, budget]
+            to_beat = None if method == ORACLE_METHOD else results.best(measure, budget)
             cells += (_cell(results.row(method, budget), measure, to_beat),)
-            if has_paper:
+            if results.has_paper:
                 paper = results.of_paper(method, budget, measure)
                 cells += (Cell("" if paper is None else f"{paper:.1f}", kind="paper"),)
         body.append(cells)
-    return Table((first, second), tuple(body))
+    first: Row = (Cell("method", kind="name"), *(Cell(name, span=width) for _, name in MEASURES))
+    return Table((first, second), tuple(body), caption)
 
 
-def _best(results: Results, measure: str, budget: int) -> float | None:
-    rows = [results.row(method, budget) for method in results.methods if method != ORACLE_METHOD]
-    return max((row[measure] for row in rows if row is not None and row[measure] is not None), default=None)
-
-
-def _cell(row: Figures | None, measure: str, best: float | None) -> Cell:
-    if row is None or row[measure] is None:
-        return Cell("")
-    value, interval = row[measure], _interval(row, measure)
-    note = "" if interval is None else f"{100 * interval[0]:.0f} to {100 * interval[1]:.0f}"
-    return Cell(f"{100 * value:.1f}", note, "best" if value == best else "")
-
-
-def _interval(row: Figures, measure: str) -> tuple[float, float] | None:
-    """Limits of a row's interval; None where it has none, as in runs of earlier software."""
-    low, high = row.get(f"{measure}_low"), row.get(f"{measure}_high")
-    return None if low is None or high is None else (low, high)
-
-
-def _details(results: Results) -> Table:
-    judged = ("budget", "f_score", "best_f", "bce", "auc", "base_rate", "queries")
-    names = (*judged, "sample_success", "trials", "mean_tries")
+def details_of(results: Results) -> Table:
+    """Everything that is known of every row."""
+    names = [name for name in ResultRow.model_fields if name != "method"]
     head: Row = (Cell("method", kind="name"), *(Cell(name.replace("_", " ")) for name in names))
     body = tuple(
-        (Cell(row["method"], kind="name"), *(Cell(_number(row.get(name))) for name in names)) for row in results.rows
+        (Cell(row.method, kind="name"), *(Cell(_number(getattr(row, name))) for name in names)) for row in results.rows
     )
     return Table((head,), body, "All figures of all rows", folded=True)
+
+
+def _cell(row: ResultRow | None, measure: Measure, best: float | None) -> Cell:
+    if row is None or (value := row.value(measure)) is None:
+        return Cell("")
+    interval = row.interval(measure)
+    note = "" if interval is None else f"{100 * interval[0]:.0f} to {100 * interval[1]:.0f}"
+    return Cell(f"{100 * value:.1f}", note, "best" if value == best and value > 0 else "")
 
 
 def _curves(results: Results) -> Drawing:
     figure = make_subplots(1, 2, subplot_titles=[f"{name} (%)" for _, name in MEASURES], horizontal_spacing=0.09)
     for column, (measure, _) in enumerate(MEASURES, start=1):
         for method in results.methods:
-            _add_curve(figure, column, results, method, measure)
-        paper = [(b, results.of_paper(BEST_METHOD, b, measure)) for b in results.budgets]
-        known = [(budget, value) for budget, value in paper if value is not None]
-        if known:
-            _add_paper(figure, column, known)
+            curve = _level(results, method, measure) if method in WITHOUT_TRIES else _curve(results, method, measure)
+            if curve is not None:
+                figure.add_trace(curve.update(showlegend=column == 1), 1, column)
+        paper = [
+            (b, value) for b in results.budgets if (value := results.of_paper(BEST_METHOD, b, measure)) is not None
+        ]
+        if paper:
+            figure.add_trace(_paper_curve(paper).update(showlegend=column == 1), 1, column)
     figure.update_xaxes(title_text="tries", tickmode="array", tickvals=[0, *results.budgets], range=[-0.3, None])
     figure.update_yaxes(rangemode="tozero")
     laid_out(figure, 430, legend={"orientation": "h", "y": -0.2, "x": 0.5, "xanchor": "center"})
@@ -180,61 +240,44 @@ def _curves(results: Results) -> Drawing:
     )
 
 
-def _add_curve(figure: go.Figure, column: int, results: Results, method: str, measure: str) -> None:
-    level = method in WITHOUT_TRIES
-    points = [(budget, row) for budget in results.budgets if (row := results.row(method, budget)) is not None]
-    points = [(budget, row) for budget, row in points if row[measure] is not None]
+def _level(results: Results, method: str, measure: Measure) -> go.Scatter | None:
+    """A line at the mean of what a method without tries reaches at all budgets, which differ by draws alone."""
+    rows = [row for budget in results.budgets if (row := results.row(method, budget)) is not None]
+    values = [value for row in rows if (value := row.value(measure)) is not None]
+    if not values:
+        return None
+    mean = 100 * sum(values) / len(values)
+    line = {"color": COLOURS.get(method, SOFT), "dash": "dash", "width": 1.8}
+    return _line(method, [0, results.budgets[-1]], [mean, mean], line).update(mode="lines")
+
+
+def _curve(results: Results, method: str, measure: Measure) -> go.Scatter | None:
+    rows = [row for budget in results.budgets if (row := results.row(method, budget)) is not None]
+    points = [(row.budget, value, row.interval(measure)) for row in rows if (value := row.value(measure)) is not None]
     if not points:
-        return
-    if level:
-        values = [row[measure] for _, row in points]
-        points = [(budget, {measure: sum(values) / len(values)}) for budget in (0, results.budgets[-1])]
-    limits = [_interval(row, measure) or (row[measure], row[measure]) for _, row in points]
-    pairs = list(zip(points, limits, strict=True))
-    figure.add_trace(
-        go.Scatter(
-            x=[budget for budget, _ in points],
-            y=[100 * row[measure] for _, row in points],
-            error_y={
-                "type": "data",
-                "array": [100 * (high - row[measure]) for (_, row), (_, high) in pairs],
-                "arrayminus": [100 * (row[measure] - low) for (_, row), (low, _) in pairs],
-                "thickness": 1,
-                "width": 3,
-                "visible": not level and method == BEST_METHOD,
-            },
-            name=plain(method),
-            legendgroup=plain(method),
-            showlegend=column == 1,
-            mode="lines" if level else "lines+markers",
-            line={
-                "color": COLOURS.get(method, SOFT),
-                "dash": "dash" if level else "solid",
-                "width": 3.5 if method == BEST_METHOD else 1.8,
-            },
-            marker={"size": 9 if method == BEST_METHOD else 7},
-            hovertemplate="%{y:.1f}",
-        ),
-        1,
-        column,
-    )
+        return None
+    ours = method == BEST_METHOD
+    line = {"color": COLOURS.get(method, SOFT), "width": 3.5 if ours else 1.8}
+    curve = _line(method, [budget for budget, _, _ in points], [100 * value for _, value, _ in points], line)
+    curve.update(marker={"size": 9 if ours else 7})
+    if ours:
+        limits = [(value, interval or (value, value)) for _, value, interval in points]
+        above, below = [100 * (high - v) for v, (_, high) in limits], [100 * (v - low) for v, (low, _) in limits]
+        curve.update(error_y={"type": "data", "array": above, "arrayminus": below, "thickness": 1, "width": 3})
+    return curve
 
 
-def _add_paper(figure: go.Figure, column: int, points: Sequence[tuple[int, float]]) -> None:
-    figure.add_trace(
-        go.Scatter(
-            x=[budget for budget, _ in points],
-            y=[value for _, value in points],
-            name=f"the paper's {BEST_METHOD}",
-            legendgroup="paper",
-            showlegend=column == 1,
-            mode="lines+markers",
-            line={"color": COLOURS[BEST_METHOD], "dash": "dot", "width": 1.2},
-            marker={"symbol": "circle-open", "size": 8},
-            hovertemplate="%{y:.1f}",
-        ),
-        1,
-        column,
+def _paper_curve(points: Sequence[tuple[int, float]]) -> go.Scatter:
+    line = {"color": COLOURS[BEST_METHOD], "dash": "dot", "width": 1.2}
+    name = f"the paper's {BEST_METHOD}"
+    curve = _line(name, [budget for budget, _ in points], [value for _, value in points], line)
+    return curve.update(marker={"symbol": "circle-open", "size": 8})
+
+
+def _line(name: str, x: Sequence[int], y: Sequence[float], line: dict[str, str | float]) -> go.Scatter:
+    label = plain(name)
+    return go.Scatter(
+        x=x, y=y, name=label, legendgroup=label, mode="lines+markers", line=line, hovertemplate="%{y:.1f}"
     )
 
 
@@ -242,7 +285,7 @@ def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.1f}"
 
 
-def _number(value: Any) -> str:
+def _number(value: float | None) -> str:
     if value is None:
         return "-"
     return f"{value:.3f}" if isinstance(value, float) else str(value)

@@ -113,7 +113,7 @@ def _drawing(curves: Mapping[str, Curve]) -> Drawing:
             )
             told.add(name)
     figure.update_annotations(font_size=13)
-    figure.update_yaxes(nticks=5)
+    figure.update_yaxes(nticks=5, exponentformat="e")
     figure.update_xaxes(nticks=5)
     legend = {"orientation": "h", "y": -0.28 / rows, "x": 0.5, "xanchor": "center", "yanchor": "top"}
     return Drawing(laid_out(figure, ROW_HEIGHT * rows + 90, legend=legend, margin={"l": 45, "r": 20, "t": 40, "b": 90}))

@@ -6,7 +6,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from cluster.configuration import CampaignConfig
-from cluster.episodes import episodes, most_telling
+from cluster.episodes import first_episodes, most_telling
+from cluster.evaluation_tables import RESULTS_FILE
+from cluster.ledger import Ledger
 from cluster.reporting.collecting import collection_section
 from cluster.reporting.failures import failures_section
 from cluster.reporting.hidden_facts import (
@@ -15,17 +17,19 @@ from cluster.reporting.hidden_facts import (
     hidden_facts_section,
     hinge_twins,
 )
-from cluster.reporting.page import Drawing, Page, Section, render, shortened
+from cluster.reporting.page import Page, Picture, Section, render, shortened
 from cluster.reporting.proposals import proposals_section
-from cluster.reporting.results import Results, results_section, tiles
+from cluster.reporting.results import Results, further_section, read_results, results_section, tiles
 from cluster.reporting.training import training_section
-from cluster.run_folder import RunFolder, read_json
+from cluster.run_folder import ObjectsUsed, RunFolder, read_json
 from shared.adaptation import Adapter
 from shared.files import read_bounded, write_atomically
 from shared.policy import Policy
 from shared.store import Store
 
 MAX_PICTURE_BYTES = 4 << 20
+MAX_FURTHER = 20
+"""Evaluations beside the run's own that are shown."""
 
 
 def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say: Callable[[str], None]) -> None:
@@ -43,30 +47,45 @@ def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say
     summary = read_json(run.summary)
     store, evaluation = Store.open(run.store), Store.open(run.evaluation)
     policy = Policy.from_files(store.read_policy(store.policy_versions()[-1]))
-    adapter, found = Adapter(policy), list(episodes(evaluation))
+    adapter, found = Adapter(policy), first_episodes(evaluation)
     say("drawing tables, curves and clouds")
+    results = read_results(
+        run.training("evaluate") / RESULTS_FILE, config.task, novel_categories=_novel(evaluation, run.objects_used())
+    )
+    further = _further(run)
     sections = [
-        results_section(_results(summary, config)),
+        *([_picture(run.picture)] if run.picture.is_file() else []),
+        results_section(results),
+        *([further_section(further)] if further else []),
         proposals_section(most_telling(found, adapter), adapter),
         _hidden_facts(run, evaluation, adapter, say) if experiments else _not_tried(run),
         failures_section(found, adapter),
         training_section(run.trainings, list(summary["stage_seconds"])),
-        collection_section(summary, store),
+        collection_section(summary, store, Ledger(run.log)),
     ]
-    if run.picture.is_file():
-        sections.insert(0, _picture(run.picture))
     page = Page(
         title=f"AdaAfford: {config.task}",
         subtitle=_subtitle(summary, config),
-        tiles=tiles(_results(summary, config)),
+        tiles=tiles(results),
         sections=tuple(sections),
         facts=_facts(summary, run),
     )
     write_atomically(run.page, render(page).encode())
 
 
-def _results(summary: Mapping[str, Any], config: CampaignConfig) -> Results:
-    return Results(config.task, summary["rows"], novel_categories=bool(config.splits.test_categories))
+def _further(run: RunFolder) -> list[tuple[str, Results]]:
+    """What `adaafford evaluate` made of the run, by name, as far as it is finished."""
+    used, found = run.objects_used(), []
+    for path in sorted(run.evaluations.glob(f"*/{RESULTS_FILE}"))[:MAX_FURTHER]:
+        novel = _novel(Store.open(path.parent / "store"), used)
+        found.append((path.parent.name, read_results(path, novel_categories=novel)))
+    return found
+
+
+def _novel(evaluation: Store, used: ObjectsUsed) -> bool:
+    """Whether an evaluation's objects are of categories that nothing was trained on."""
+    tested = {ref.category for ref in evaluation.setting.objects}
+    return tested.isdisjoint(ref.category for ref in (*used.train, *used.validation))
 
 
 def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Callable[[str], None]) -> Section:
@@ -83,8 +102,8 @@ def _not_tried(run: RunFolder) -> Section:
 
 def _picture(path: Path) -> Section:
     caption = "Affordance before and after each try, as the camera sees it."
-    picture = Drawing(None, caption, picture=read_bounded(path, MAX_PICTURE_BYTES))
-    return Section("glance", "At a glance", drawings=(picture,))
+    picture = Picture(read_bounded(path, MAX_PICTURE_BYTES), caption)
+    return Section("glance", "At a glance", pictures=(picture,))
 
 
 def _subtitle(summary: Mapping[str, Any], config: CampaignConfig) -> str:

@@ -23,12 +23,12 @@ function scenes(layout) {
 }
 
 function turnTogether(node, event) {
-  const turned = Object.keys(event).filter((name) => name.endsWith(".camera"));
-  if (turned.length !== 1) return; // None was turned, or all were, by the lines below.
-  node.camera = event[turned[0]];
-  const others = scenes(node.layout).filter((name) => name + ".camera" !== turned[0]);
-  if (others.length > 1) Plotly.relayout(node, Object.fromEntries(others.map((name) => [name + ".camera", node.camera])));
-  else if (others.length) node.layout[others[0]].camera = node.camera, Plotly.redraw(node);
+  const turned = Object.keys(event).find((name) => name.endsWith(".camera"));
+  if (!turned || node.turning) return;
+  node.camera = event[turned];
+  node.turning = true; // What follows is such an event again.
+  Plotly.relayout(node, Object.fromEntries(scenes(node.layout).map((name) => [name + ".camera", node.camera])))
+    .then(() => { node.turning = false; });
 }
 
 const watch = new IntersectionObserver((entries) => {
