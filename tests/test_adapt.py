@@ -1,0 +1,478 @@
+"""Adapting to scans: frames come back, hostile files are refused, and files say what the loop in memory says."""
+
+import io
+import json
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from adaafford.heatmaps import colours, write_heatmap
+from adaafford.histories import MAX_TRIES, History, TriedOutcome, read_history, write_history
+from adaafford.pretrained import load_policy, only_pretrained, pretrained_names
+from adaafford.scans import ScanFrame, action_at, checked_scan, observation_of, read_scan
+from adaafford.sessions import Session, SessionFiles, Step
+from cluster.cli import run as adaafford
+from shared.adaptation import Adapter
+from shared.errors import AdaAffordError, StoreError, UsageError
+from shared.geometry import points_in_view
+from shared.networks.configuration import NetworkConfig
+from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
+from shared.vocabulary import Float, OutcomeKind
+from tests.finished_run import make_finished_run
+
+NETWORK = NetworkConfig(
+    centres=(32, 8), radii=(0.3, 0.8), neighbours=4, abstraction=((8,), (16,)), propagation=((16,), (16,)),
+    feature_width=16, latent_width=16,
+)  # fmt: skip
+
+
+def front(count: int = 3000, seed: int = 1) -> Float:
+    """A cabinet's front, 0.9 m ahead of a camera at the origin, z up."""
+    return np.random.default_rng(seed).uniform([0.9, -0.3, -0.4], [0.95, 0.3, 0.4], (count, 3))
+
+
+@pytest.fixture
+def policy_folder(tmp_path: Path) -> Path:
+    policy = Policy.untrained("pull-closed-door", NETWORK, seed=5)
+    for name in ("prior", "aap", "aip"):
+        policy.with_trained(name)
+    folder = tmp_path / "policy"
+    folder.mkdir()
+    for name, data in policy.to_files(half=True).items():
+        (folder / name).write_bytes(data)
+    return folder
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    path = tmp_path / "object" / "scan.npz"
+    path.parent.mkdir()
+    np.savez(path, points=front())
+    return path
+
+
+def session(policy_folder: Path, scan: Path, **changes: object) -> Session:
+    files = SessionFiles(scan.parent / "history.json", scan.parent / "heatmap.npz")
+    return Session(load_policy(policy_folder), files, **changes)  # type: ignore[arg-type]
+
+
+# Frames.
+
+
+direction = arrays(np.float64, 3, elements=st.floats(-1, 1)).filter(lambda v: float(np.linalg.norm(v)) > 0.1)
+
+
+@given(up=direction, origin=arrays(np.float64, 3, elements=st.floats(-2, 2)))
+def test_points_and_directions_come_back_and_up_is_up(up: Float, origin: Float) -> None:
+    frame = ScanFrame(up=tuple(up), origin=tuple(origin), camera=(0.0, 0.0, 0.0))
+    rotation = frame.world_from_scan
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    np.testing.assert_allclose(rotation @ up / np.linalg.norm(up), [0, 0, 1], atol=1e-12)
+    points = front(20)
+    np.testing.assert_allclose([frame.point_to_scan(p) for p in frame.to_world(points)], points, atol=1e-12)
+    np.testing.assert_allclose(frame.direction_to_scan(rotation @ up), up, atol=1e-12)
+
+
+def test_how_a_scan_is_turned_and_moved_changes_nothing_that_networks_see() -> None:
+    """A camera's own frame (x right, y down, z forward) and a robot's (z up, elsewhere) show the same."""
+    points = front()
+    robot = checked_scan(points + np.array([3.0, 4.0, 1.0]))
+    optical = checked_scan(np.stack([-points[:, 1], -points[:, 2], points[:, 0]], axis=1))
+    expected = points - (points.min(axis=0) + points.max(axis=0)) / 2
+    for scan, up, camera in ((robot, (0.0, 0.0, 1.0), (3.0, 4.0, 1.0)), (optical, (0.0, -1.0, 0.0), (0.0, 0.0, 0.0))):
+        observation = observation_of(scan, ScanFrame.around(scan, up, camera))
+        # The camera looks along +x of the view frame, with z up, as it does in what the points were made in.
+        np.testing.assert_allclose(points_in_view(observation), expected[observation.pixels], atol=2e-3)
+
+
+def test_estimated_normals_face_the_camera() -> None:
+    flat = front()
+    flat[:, 0] = 0.9
+    scan = checked_scan(flat)
+    normals = observation_of(scan, ScanFrame.around(scan)).normals
+    world = ScanFrame.around(scan).world_from_scan @ [-1.0, 0.0, 0.0]
+    assert (normals @ world > 0.98).all()
+
+
+def test_an_action_far_from_the_cloud_is_refused() -> None:
+    scan = checked_scan(front())
+    frame = ScanFrame.around(scan)
+    observation = observation_of(scan, frame)
+    found = action_at(observation, frame, (0.9, 0.1, 0.2), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    assert np.linalg.norm(frame.point_to_scan(found.point) - [0.9, 0.1, 0.2]) < 0.06
+    np.testing.assert_allclose(frame.direction_to_scan(found.approach), [1, 0, 0], atol=1e-9)
+    with pytest.raises(UsageError, match="off the cloud"):
+        action_at(observation, frame, (900.0, 100.0, 200.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    with pytest.raises(UsageError, match="not parallel"):
+        action_at(observation, frame, (0.9, 0.1, 0.2), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+
+
+# Files.
+
+
+def ply(points: Float, encoding: str = "ascii", extra: bool = False) -> bytes:
+    names = ["x", "y", "z", *(["nx", "ny", "nz", "movable"] if extra else [])]
+    values = np.column_stack([points, np.tile([-1.0, 0, 0, 1], (len(points), 1))]) if extra else points
+    header = f"ply\nformat {encoding} 1.0\nelement vertex {len(points)}\n"
+    header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    if encoding == "ascii":
+        return (header + "\n".join(" ".join(map(repr, row.tolist())) for row in values) + "\n").encode()
+    return header.encode() + values.astype("<f4").tobytes()
+
+
+def pcd(points: Float, encoding: str = "ascii") -> bytes:
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z _ rgb\nSIZE 4 4 4 1 4\nTYPE F F F U U\nCOUNT 1 1 1 3 1\n"
+        f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0.5 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {encoding}\n"
+    )
+    if encoding == "ascii":
+        rows = "\n".join(" ".join([*map(repr, row.tolist()), "0 0 0 255"]) for row in points)
+        return (header + rows + "\n").encode()
+    return header.encode() + b"".join(struct.pack("<fff3BI", *row, 0, 0, 0, 255) for row in points)
+
+
+def test_every_format_gives_the_same_points(tmp_path: Path) -> None:
+    points = front(200)
+    np.savez(tmp_path / "a.npz", points=points)
+    (tmp_path / "b.ply").write_bytes(ply(points))
+    (tmp_path / "c.ply").write_bytes(ply(points, "binary_little_endian", extra=True))
+    (tmp_path / "d.pcd").write_bytes(pcd(points))
+    (tmp_path / "e.pcd").write_bytes(pcd(points, "binary"))
+    for path in sorted(tmp_path.iterdir()):
+        np.testing.assert_allclose(read_scan(path).points, points, atol=1e-6, err_msg=path.name)
+    full = read_scan(tmp_path / "c.ply")
+    assert full.normals is not None
+    assert full.movable is not None
+    assert full.movable.all()
+    assert read_scan(tmp_path / "e.pcd").camera == (0.5, 0.0, 0.0)
+
+
+def test_what_a_depth_camera_missed_is_left_out() -> None:
+    points = np.concatenate([front(100), np.full((40, 3), np.nan), [[np.inf, 0, 0]]])
+    scan = checked_scan(points, normals=np.ones_like(points), movable=np.arange(141) % 2)
+    assert len(scan.points) == 100
+    assert scan.normals is not None
+    assert len(scan.normals) == 100
+    assert scan.movable is not None
+    assert scan.movable.sum() == 50
+
+
+def packed(**held: object) -> bytes:
+    data = io.BytesIO()
+    np.savez_compressed(data, **held)  # type: ignore[arg-type]
+    return data.getvalue()
+
+
+def bomb() -> bytes:
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("points.npy", "w") as entry:
+        for _ in range(136):
+            entry.write(bytes(1 << 20))
+    return data.getvalue()
+
+
+def lying_npy() -> bytes:
+    """An array that announces a hundred gigabytes and holds none."""
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (5000000000, 3), }"
+    header += b" " * (64 - (len(header) + 11) % 64) + b"\n"
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        archive.writestr("points.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
+    return data.getvalue()
+
+
+HOSTILE = {
+    "pickle.npz": packed(points=np.array([{"a": print}] * 99, dtype=object)),
+    "bomb.npz": bomb(),
+    "lying.npz": lying_npy(),
+    "empty.npz": packed(),
+    "words.npz": packed(points=np.array([["a", "b", "c"]] * 99)),
+    "flat.npz": packed(points=np.zeros((99, 2))),
+    "few.npz": packed(points=front(10)),
+    "nan.npz": packed(points=np.full((99, 3), np.nan)),
+    "point.npz": packed(points=np.zeros((99, 3))),
+    "millimetres.npz": packed(points=1000 * front(99)),
+    "normals.npz": packed(points=front(99), normals=np.zeros((98, 3))),
+    "camera.npz": packed(points=front(99), camera=np.array([np.nan, 0, 0])),
+    "zip.npz": b"PK\x03\x04 cut off",
+    "nothing.ply": b"",
+    "other.ply": b"solid stl",
+    "endless.ply": b"ply\nformat ascii 1.0\nelement vertex 5\n",
+    "huge.ply": ply(front(99), "binary_little_endian").replace(b"vertex 99", b"vertex 999999999999"),
+    "words.ply": ply(front(99)).replace(b"0.9", b"zero"),
+    "cut.ply": ply(front(99), "binary_little_endian")[:-8],
+    "faces.ply": b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nend_header\n3 0 1 2\n",
+    "header.pcd": b"FIELDS x y z\n" * 2000,
+    "huge.pcd": pcd(front(99), "binary").replace(b"POINTS 99", b"POINTS 99999999999"),
+    "compressed.pcd": pcd(front(99)).replace(b"DATA ascii", b"DATA binary_compressed"),
+    "words.pcd": pcd(front(99)).replace(b"0.9", b"zero"),
+    "missing.pcd": pcd(front(99)).replace(b"FIELDS x y z", b"FIELDS x y w"),
+    "twice.pcd": pcd(front(99)).replace(b"FIELDS x y z", b"FIELDS x x z"),
+    "type.pcd": pcd(front(99)).replace(b"TYPE F F F", b"TYPE O F F"),
+    "cloud.xyz": b"0 0 0\n",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_cloud_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(HOSTILE[name])
+    with pytest.raises(AdaAffordError) as refused:
+        read_scan(tmp_path / name)
+    assert name in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@settings(max_examples=60, deadline=None)
+@given(kind=st.sampled_from(["ply", "pcd", "npz"]), place=st.integers(0, 400), byte=st.integers(0, 255))
+def test_a_flipped_byte_is_read_or_refused(
+    kind: str, place: int, byte: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    whole = bytearray({"ply": ply(front(70)), "pcd": pcd(front(70), "binary"), "npz": packed(points=front(70))}[kind])
+    whole[place] = byte
+    path = tmp_path_factory.getbasetemp() / f"flipped.{kind}"
+    path.write_bytes(whole)
+    try:
+        assert np.isfinite(read_scan(path).points).all()
+    except AdaAffordError as refused:
+        assert "\n" not in str(refused)
+
+
+def test_a_history_comes_back(tmp_path: Path) -> None:
+    frame = ScanFrame(origin=(0.9, 0.0, 0.0))
+    history = History.model_validate(
+        {"frame": frame, "interactions": [
+            {"cloud": "a/scan.ply", "point": (1, 2, 3), "approach": (1, 0, 0), "forward": (0, 0, 1),
+             "outcome": {"motion": 0.2}},
+        ]}
+    )  # fmt: skip
+    write_history(tmp_path / "history.json", history)
+    assert read_history(tmp_path / "history.json") == history
+
+
+@pytest.mark.parametrize(
+    ("told", "success"),
+    [
+        (TriedOutcome(motion=0.2), True),
+        (TriedOutcome(motion=0.005), False),
+        (TriedOutcome(motion=0.2, success=False), False),
+        (TriedOutcome(motion=0.2, kind=OutcomeKind.NO_GRASP), False),
+    ],
+)
+def test_an_outcome_succeeds_by_its_motion_unless_told(told: TriedOutcome, success: bool) -> None:
+    assert told.outcome.success is success
+    assert told.outcome.motion == told.motion
+
+
+def entry(**changes: object) -> dict[str, object]:
+    known: dict[str, object] = {"cloud": "scan.npz", "point": [0.92, 0, 0], "approach": [1, 0, 0]}
+    return known | {"forward": [0, 0, 1], "outcome": {"motion": 0.1}} | changes
+
+
+def history_text(*interactions: object, **changes: object) -> str:
+    known = {"format": "adaafford-history", "schema_version": 1, "frame": {"origin": [0.92, 0, 0]}}
+    return json.dumps(known | {"interactions": interactions} | changes)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "Invalid JSON"),
+        ("[" * 5000, "Invalid JSON"),
+        (" " * (2 << 20), "larger than"),
+        (history_text(format="other"), "format"),
+        (history_text(schema_version=2), "schema_version"),
+        (history_text(frame={"origin": [0, 0, 0], "up": [0, 0, 0]}), "needs a direction"),
+        (history_text(frame={"origin": [float("nan"), 0, 0]}), "origin"),
+        (history_text(entry(cloud="/etc/passwd")), "without '..'"),
+        (history_text(entry(cloud="../scan.npz")), "without '..'"),
+        (history_text(entry(outcome={"motion": -1})), "motion"),
+        (history_text(entry(outcome={"motion": 1e9})), "motion"),
+        (history_text(entry(point=[1, 2])), "point"),
+        (history_text(entry(more=1)), "more"),
+        (history_text(entry(outcome=None), entry()), "has no outcome though others follow"),
+        (history_text(*[entry()] * (MAX_TRIES + 1)), "interactions"),
+    ],
+)
+def test_a_hostile_history_is_refused_in_one_line(text: str, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "history.json").write_text(text)
+    with pytest.raises((UsageError, StoreError)) as refused:
+        read_history(tmp_path / "history.json")
+    assert expected in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_heatmaps_of_every_format_hold_the_affordance(tmp_path: Path) -> None:
+    import plotly.io  # noqa: F401  Its import may warn; the page alone is asked about below.
+
+    points, heat = front(50), np.linspace(0, 1, 50, dtype=np.float32)
+    for name in ("heat.ply", "heat.npz", "heat.html"):
+        write_heatmap(tmp_path / name, points, heat, np.arange(50, dtype=np.uint32))
+    held = np.load(tmp_path / "heat.npz", allow_pickle=False)
+    np.testing.assert_array_equal(held["affordance"], heat)
+    np.testing.assert_allclose(read_scan_points(tmp_path / "heat.ply"), points, atol=1e-6)
+    page = (tmp_path / "heat.html").read_text()
+    assert "<html" in page
+    assert 'src="http' not in page
+    assert (colours(heat)[[0, -1]] == [[30, 60, 140], [200, 20, 30]]).all()
+    with pytest.raises(UsageError, match=r"allowed: \.ply, \.npz, \.html"):
+        write_heatmap(tmp_path / "heat.obj", points, heat, np.arange(50, dtype=np.uint32))
+
+
+def read_scan_points(path: Path) -> Float:
+    from trimesh.exchange.ply import load_ply
+
+    with path.open("rb") as file:
+        return np.asarray(load_ply(file)["vertices"])
+
+
+# Policies.
+
+
+def test_a_policy_is_found_by_folder_file_run_or_name(
+    policy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = load_policy(policy_folder).to_files()
+    assert load_policy(policy_folder / WEIGHTS_FILE).to_files() == wanted
+    run = make_finished_run(tmp_path / "run", objects=2)
+    assert load_policy(run.path).task == "push-faucet"
+    brought = tmp_path / "pretrained"
+    brought.mkdir()
+    (brought / "pull-closed-door").symlink_to(policy_folder)
+    monkeypatch.setattr("adaafford.pretrained.PRETRAINED_FOLDER", brought)
+    assert pretrained_names() == [only_pretrained()] == ["pull-closed-door"]
+    assert load_policy("pull-closed-door").to_files() == wanted
+    with pytest.raises(UsageError, match=r"no policy 'push': give a name \(pull-closed-door\)"):
+        load_policy("push")
+
+
+def test_scores_in_half_precision_agree(policy_folder: Path) -> None:
+    whole = Policy.untrained("pull-closed-door", NETWORK, seed=5)
+    scan = checked_scan(front())
+    observation = observation_of(scan, ScanFrame.around(scan))
+    before, after = (Adapter(p).affordance(observation, []) for p in (whole, load_policy(policy_folder)))
+    np.testing.assert_allclose(before, after, atol=1e-2)
+
+
+def test_an_exported_policy_has_a_card_and_adapts(tmp_path: Path, scan: Path) -> None:
+    run = make_finished_run(tmp_path / "run", objects=2)
+    out = tmp_path / "exported"
+    for _ in range(2):
+        assert adaafford(["export-policy", str(run.path), "--out", str(out)]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["README.md", POLICY_FILE, WEIGHTS_FILE]
+    card = (out / "README.md").read_text()
+    for word in (
+        "push-faucet",
+        "procedural objects only",
+        "licence | MIT",
+        "half precision",
+        "## Limits",
+        "## Results",
+    ):
+        assert word in card
+    assert session(out, scan).step(scan).do == "try"
+
+
+def test_an_export_leaves_other_files_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make_finished_run(tmp_path / "run", objects=2)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("")
+    assert adaafford(["export-policy", str(run.path), "--out", str(tmp_path / "mine")]) == 2
+    assert "holds something that is no exported policy" in capsys.readouterr().err
+
+
+# The loop.
+
+
+def test_a_session_fills_its_history_and_then_acts(policy_folder: Path, scan: Path) -> None:
+    live = session(policy_folder, scan, budget=1)
+    first = live.step(scan)
+    assert (first.do, first.tries) == ("try", 0)
+    history = read_history(scan.parent / "history.json")
+    assert history.pending is not None
+    assert history.pending.point == first.point
+    heat = np.load(scan.parent / "heatmap.npz")
+    assert heat["points"].shape == (2048, 3)
+    np.testing.assert_allclose(heat["points"], front()[heat["indices"]], atol=1e-3)
+    second = live.step(scan, TriedOutcome(motion=0.3))
+    assert (second.do, second.tries) == ("act", 1)
+    assert not np.array_equal(np.load(scan.parent / "heatmap.npz")["affordance"], heat["affordance"])
+    assert len(read_history(scan.parent / "history.json").interactions) == 2
+
+
+def without_time(step: Step) -> Step:
+    return step.model_copy(update={"seconds": 0.0})
+
+
+def test_a_step_that_is_asked_for_again_is_the_same(policy_folder: Path, scan: Path) -> None:
+    steps = [session(policy_folder, scan).step(scan) for _ in range(2)]
+    assert without_time(steps[0]) == without_time(steps[1])
+    assert len(read_history(scan.parent / "history.json").interactions) == 1
+
+
+def test_files_carry_a_session_over_processes(policy_folder: Path, scan: Path, tmp_path: Path) -> None:
+    """Begun anew before every step, a session says what one that lives on says."""
+    other = tmp_path / "other" / scan.name
+    other.parent.mkdir()
+    other.write_bytes(scan.read_bytes())
+    alive = session(policy_folder, scan)
+    outcomes = [None, TriedOutcome(motion=0.0), TriedOutcome(motion=0.2)]
+    lasting = [alive.step(scan, outcome) for outcome in outcomes]
+    anew = [session(policy_folder, other).step(other, outcome) for outcome in outcomes]
+    assert [without_time(step) for step in lasting] == [without_time(step) for step in anew]
+
+
+def test_misuse_is_refused_and_changes_nothing(policy_folder: Path, scan: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no proposal that waits"):
+        session(policy_folder, scan).step(scan, TriedOutcome(motion=0.2))
+    assert not (scan.parent / "history.json").exists()
+    session(policy_folder, scan).step(scan)
+    before = (scan.parent / "history.json").read_bytes()
+    with pytest.raises(UsageError, match="was begun with up"):
+        session(policy_folder, scan, up=(0.0, 1.0, 0.0)).step(scan)
+    np.savez(tmp_path / "elsewhere.npz", points=front())
+    with pytest.raises(UsageError, match="does not lie beside the history"):
+        session(policy_folder, scan).step(tmp_path / "elsewhere.npz")
+    assert (scan.parent / "history.json").read_bytes() == before
+
+
+def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
+    policy_folder: Path, scan: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ["--cloud", str(scan), "--history", str(scan.parent / "history.json"), "--policy", str(policy_folder)]
+    assert adaafford(["adapt", *where]) == 0
+    first = json.loads(capsys.readouterr().out)
+    assert (first["do"], first["tries"]) == ("try", 0)
+    assert (scan.parent / "heatmap.ply").is_file()
+    assert adaafford(["adapt", *where, "--outcome", "0.2"]) == 0
+    assert json.loads(capsys.readouterr().out)["tries"] == 1
+    for wrong, expected in (
+        (["--outcome", "-1"], "--outcome: setting 'motion'"),
+        (["--kind", "no-grasp"], "give --outcome MOTION"),
+        (["--out", "heat.obj"], "not a kind of heatmap"),
+        (["--budget", "0"], "at least one try"),
+    ):
+        assert adaafford(["adapt", *where, *wrong]) == 2
+        line = capsys.readouterr().err
+        assert expected in line
+        assert line.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_robot_may_follow_line_by_line(policy_folder: Path, scan: Path) -> None:
+    command = [sys.executable, "-m", "cluster", "adapt", "--cloud", str(scan), "--policy", str(policy_folder)]
+    command += ["--history", str(scan.parent / "history.json"), "--follow"]
+    lines = ['{"cloud": "scan.npz", "outcome": {"motion": 0.2}}', "nonsense", '{"cloud": "../x.npz"}']
+    done = subprocess.run(command, input="\n".join(lines) + "\n", capture_output=True, text=True, check=True)
+    first, second, *refused = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [first["tries"], second["tries"]] == [0, 1]
+    assert second["seconds"] < 1
+    assert [list(each) for each in refused] == [["error"]] * 2
