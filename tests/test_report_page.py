@@ -23,11 +23,11 @@ from cluster.ledger import Ledger
 from cluster.reporting.clouds import TANGENT, Panel, draw_panels, tried
 from cluster.reporting.collecting import wilson
 from cluster.reporting.failures import Failure, varied
-from cluster.reporting.hidden_facts import Laboratory, hinge_twins, variations
+from cluster.reporting.laboratory import Laboratory, hinge_twins, variations
 from cluster.reporting.page import MAX_TEXT, Drawing, Page, Section, plain, render, shortened
 from cluster.reporting.published import published
 from cluster.reporting.results import ResultRow, Results, table_of
-from cluster.reporting.training import read_metrics
+from cluster.reporting.training import after_tries, curves_of, read_entries
 from cluster.run_folder import ObjectsUsed, RunFolder, begin
 from shared.adaptation import Adapter
 from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
@@ -286,7 +286,7 @@ def test_the_paper_has_figures_for_every_task_and_method() -> None:
     for task in TASKS:
         for method in get_args(MethodName):
             told = published(task, novel_categories=False)[method]
-            assert all(0 < told.at(budget, "f_score") < 100 for budget in (1, 2, 4))  # type: ignore[operator]
+            assert all(0 < (told.at(budget, "f_score") or 0) < 100 for budget in (1, 2, 4))
             assert told.at(3, "f_score") is None or len(told.f_score) == 1
     assert published("pull-closed-door", novel_categories=False)["ours-final"].at(4, "sample_success") == 22.14
     assert published("push", novel_categories=True)["where2act"].at(2, "f_score") == 59.95
@@ -315,9 +315,20 @@ def test_a_task_that_the_paper_lacks_has_no_columns_of_it() -> None:
 
 def test_metrics_that_a_kill_tore_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
-    lines = ['{"step": 1, "score": 0.5, "loss_a": 2, "auc": 0.9}', "[1]", '{"step": "x", "score": 1}']
+    lines = [
+        '{"step": 1, "score": 0.5, "loss_a": 2, "auc": 0.9}',
+        "[1]",
+        '{"step": "x", "score": 1}',
+        f'{{"step": 1{"0" * 999}, "score": 1}}',
+    ]
     path.write_text("\n".join([*lines, '{"step": 2, "score": NaN}', '{"step": 3, "score": 0.25, "lo']))
-    assert read_metrics(path) == {"score": ([1], [0.5]), "loss_a": ([1], [2.0])}
+    assert curves_of(read_entries(path)) == {"score": ([1], [0.5]), "loss_a": ([1], [2.0])}
+
+
+def test_what_a_validation_says_after_tries_is_found_by_their_number() -> None:
+    entry = {"step": 9.0, "bce_after_8": 0.1, "bce_after_0": 0.5, "bce_after_x": 1.0, "auc_after_0": 0.7}
+    assert after_tries(entry, "bce") == [(0, 0.5), (8, 0.1)]
+    assert after_tries(entry, "f_score") == []
 
 
 def test_a_huge_file_of_metrics_is_refused(tmp_path: Path) -> None:
@@ -325,7 +336,7 @@ def test_a_huge_file_of_metrics_is_refused(tmp_path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(1 << 30)
     with pytest.raises(StoreError, match="larger than"):
-        read_metrics(path)
+        read_entries(path)
 
 
 def test_wilsons_interval_holds_the_share_and_narrows() -> None:

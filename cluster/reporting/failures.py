@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from cluster.episodes import Episode
 from cluster.reporting.clouds import Arrow, Panel, draw_panels
 from cluster.reporting.page import Drawing, Section, plain
-from cluster.reporting.proposals import hidden, verdict
 from cluster.reporting.style import FAILURE
+from cluster.reporting.words import hidden, verdict
 from shared.adaptation import Adapter
 from shared.records import InteractionRecord
-from shared.vocabulary import Interaction
 
 SHOWN = 4
 LOOKED_AT = 60
@@ -65,7 +64,6 @@ def _believed(episode: Episode, row: InteractionRecord, adapter: Adapter) -> Fai
 def _panel(failure: Failure, adapter: Adapter) -> Panel:
     episode, row = failure.episode, failure.row
     observation = episode.seen_by(row)
-    said = verdict(Interaction(observation, row.action, row.outcome))
-    title = f"{plain(episode.rollout.object.id)}: believed {100 * failure.belief:.0f}%<br>{plain(said)}"
+    title = f"{plain(episode.rollout.object.id)}: believed {100 * failure.belief:.0f}%<br>{verdict(row.outcome)}"
     values = adapter.affordance(observation, episode.before(row))
     return Panel(title, observation, values, (Arrow(row.action, FAILURE),))

@@ -1,206 +1,13 @@
-"""Affordance under hidden facts: one is varied at a time, the same actions are tried, and the affordance is adapted.
-
-AdaAfford, Fig. 4. What is seen is the same under every value, so that whatever differs was learnt from the tries.
-"""
+"""Affordance under hidden facts: friction, mass, direction and hinge side, one at a time (AdaAfford, Fig. 4)."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from math import sqrt
-from pathlib import Path
-from typing import Literal
-
-import numpy as np
 
 from cluster.reporting.clouds import Panel, draw_panels, tried
-from cluster.reporting.page import Drawing, Section, plain
+from cluster.reporting.laboratory import TRIES, Laboratory, Posterior, variations
+from cluster.reporting.page import Drawing, Section, plain, shortened
+from cluster.reporting.words import after
 from collector.articulation import ArticulatedObject
-from collector.catalogue import load_ref
-from collector.clock import StageClock
-from collector.environment import SapienEnvironment
-from collector.partnet import read_object
-from collector.procedural.assembly import normalised
-from collector.procedural.cabinets import storage_furniture
-from collector.procedural.writing import write_object
-from shared import seeds
 from shared.adaptation import Adapter
-from shared.configuration import Range
-from shared.errors import ObjectError
-from shared.geometry import camera_pose
-from shared.plan import ObjectRef, Setting
-from shared.proposers import proposer_named
-from shared.tasks import task_named
-from shared.vocabulary import Action, Direction, Float32, HiddenDynamics, Interaction, Observation
-
-TRIES = 4
-"""Actions that are tried under each value."""
-TRIED_BY = "fps"
-"""Who chooses them, with what comes of them under the first value: spread over what looks actionable."""
-OBJECTS_TRIED = 5
-"""Test objects that are looked at, at the most, for one that can be read and shows a part to act on."""
-ELEVATION_DEG = 40.0
-CABINET_M = (1.0, 0.6, 1.2, 0.03)
-"""Width, depth, height and overhang of the cabinet that is hung on either side."""
-HINGE_TASKS = ("StorageFurniture",)
-
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """One value of a hidden fact."""
-
-    label: str
-    target: ArticulatedObject
-    dynamics: HiddenDynamics
-
-
-@dataclass(frozen=True, slots=True)
-class Variation:
-    """A hidden fact and the values that it takes."""
-
-    name: str
-    cases: tuple[Case, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Posterior:
-    """What the tries under one value taught."""
-
-    label: str
-    observation: Observation
-    history: tuple[Interaction, ...]
-    affordance: Float32
-
-
-class Laboratory:
-    """Where the experiments take place: a run's task, camera, fidelity and policy.
-
-    Args:
-        setting: of the run's evaluation.
-        adapter: its policy.
-    """
-
-    def __init__(self, setting: Setting, adapter: Adapter) -> None:
-        self.setting = setting
-        self.adapter = adapter
-        self.task = task_named(setting.task)
-
-    def posteriors(self, variation: Variation) -> list[Posterior]:
-        """The affordance under each value after the same tries; values under which nothing can be tried are skipped."""
-        found: list[Posterior] = []
-        actions: list[Action] = []
-        for case in variation.cases:
-            environment = self._environment(case)
-            if not environment.reset(self._rng("state")) or not environment.shows_a_target():
-                continue
-            if actions:
-                history = [self._try(environment, action) for action in actions]
-            else:
-                history = self._choose(environment)
-                actions = [interaction.action for interaction in history]
-            observation = history[0].observation
-            affordance = self.adapter.affordance(observation, history)
-            found.append(Posterior(case.label, observation, tuple(history), affordance))
-        return found
-
-    def _environment(self, case: Case) -> SapienEnvironment:
-        collection = self.setting.collection
-        middle = (collection.camera.azimuth_deg.low + collection.camera.azimuth_deg.high) / 2
-        return SapienEnvironment(
-            case.target,
-            self.task,
-            self.setting.terms.primitive,
-            case.dynamics,
-            camera_pose(middle, ELEVATION_DEG, collection.camera.distance),
-            collection.camera,
-            collection.fidelity,
-            self._rng("pixels"),
-            StageClock(),
-        )
-
-    def _choose(self, environment: SapienEnvironment) -> list[Interaction]:
-        proposer = proposer_named(TRIED_BY, self.adapter, self._rng("tries"), TRIES)
-        start, history = environment.state(), list[Interaction]()
-        for _ in range(TRIES):
-            environment.restore(start)
-            observation = environment.observe()
-            action = proposer.propose(observation, history)
-            if action is None:
-                break
-            history.append(Interaction(observation, action, environment.execute(action)))
-        environment.restore(start)
-        return history
-
-    def _try(self, environment: SapienEnvironment, action: Action) -> Interaction:
-        start = environment.state()
-        observation = environment.observe()
-        movable = np.flatnonzero(observation.movable)
-        nearest = movable[np.linalg.norm(observation.points[movable] - action.point, axis=1).argmin()]
-        here = replace(action, point_index=int(nearest))
-        outcome = environment.execute(here)
-        environment.restore(start)
-        return Interaction(observation, here, outcome)
-
-    def _rng(self, purpose: str) -> np.random.Generator:
-        """The same for every value, so that everything that is drawn is the same."""
-        return seeds.generator(self.setting.seed, f"report/{purpose}", 0)
-
-
-def variations(setting: Setting, target: ArticulatedObject, twins: Sequence[ArticulatedObject]) -> list[Variation]:
-    """What can be varied: three numbers of an object, its direction if the task hides it, and the side of a hinge.
-
-    Args:
-        setting: of the run's evaluation.
-        target: a test object.
-        twins: the same cabinet hung on its left and on its right; none where the task is not about doors.
-    """
-    ranges, task = setting.terms.dynamics, task_named(setting.task)
-    middle = HiddenDynamics(
-        part_mass=_middle(ranges.part_mass),
-        joint_friction=_middle(ranges.joint_friction),
-        surface_friction=_middle(ranges.surface_friction),
-        direction=task.directions[0],
-    )
-
-    def cases(name: Literal["joint_friction", "part_mass", "surface_friction"], interval: Range) -> tuple[Case, ...]:
-        values = (interval.low, _middle(interval), interval.high)
-        return tuple(Case(f"{value:.2g}", target, _with(middle, name, value)) for value in values)
-
-    found = [
-        Variation("joint friction", cases("joint_friction", ranges.joint_friction)),
-        Variation("part mass", cases("part_mass", ranges.part_mass)),
-        Variation("surface friction", cases("surface_friction", ranges.surface_friction)),
-    ]
-    if len(task.directions) > 1:
-        ways = tuple(Case(way.value, target, replace(middle, direction=way)) for way in task.directions)
-        found.append(Variation("direction", ways))
-    if twins:
-        built = replace(middle, direction=Direction.AS_BUILT)
-        sides = zip(("hinge on the left", "hinge on the right"), twins, strict=True)
-        found.append(Variation("hinge side", tuple(Case(side, twin, built) for side, twin in sides)))
-    return found
-
-
-def hinge_twins(setting: Setting, folder: Path) -> list[ArticulatedObject]:
-    """One cabinet with a closed overlay door, hung on its left and on its right: no camera tells them apart.
-
-    Args:
-        setting: of the run's evaluation; tasks that are not about cabinets get none.
-        folder: where they are written.
-    """
-    categories = task_named(setting.task).categories
-    if categories and not set(categories) & set(HINGE_TASKS):
-        return []
-    left = write_object(folder / "left", normalised(storage_furniture("left", *CABINET_M)))
-    right = write_object(folder / "right", normalised(storage_furniture("right", *CABINET_M)))
-    return [read_object(left), read_object(right)]
-
-
-def first_readable(folder: Path, refs: Sequence[ObjectRef], setting: Setting) -> ArticulatedObject | None:
-    """The first of some test objects that can still be read; None where none of the first few can."""
-    for ref in refs[:OBJECTS_TRIED]:
-        with suppress(ObjectError):
-            return load_ref(folder, ref, setting.collection.collision)
-    return None
 
 
 def hidden_facts_section(
@@ -219,23 +26,25 @@ def hidden_facts_section(
         say(f"trying hidden facts, {number} of {len(found)}: {variation.name}")
         posteriors = laboratory.posteriors(variation)
         if posteriors:
-            drawings.append(_drawing(variation.name, posteriors))
+            drawings.append(_drawing(variation.name, posteriors, laboratory.adapter))
     if not drawings:
-        return Section(key, title, (f"Nothing could be tried on {target.ref.category} {target.ref.id}.",))
+        return Section(key, title, (f"Nothing could be tried on {target.ref.id}.",))
     lead = (
-        f"{target.ref.category} {target.ref.id}, not seen in training"
+        f"{shortened(target.ref.category)} {target.ref.id}, not seen in training"
         + (" (for the hinge's side: one cabinet, hung on its left and on its right)" if twins else "")
-        + f". Under each value the same {TRIES} actions were tried (green: success, red: failure); all other hidden "
-        "facts stay at the middle of their range. Every cloud of a row looks the same to the camera, so that what "
-        "differs in colour was learnt from the tries. Drag a cloud to turn all.",
+        + f". First before any try; then, under each value, after the same {TRIES} tries (green: success, red: "
+        "failure), with all other hidden facts at the middle of their range. Every cloud of a row looks the same to "
+        "the camera, so that what differs in colour was learnt from the tries. Drag a cloud to turn all.",
     )
     return Section(key, title, lead, drawings=tuple(drawings))
 
 
-def _drawing(name: str, posteriors: Sequence[Posterior]) -> Drawing:
-    panels = [
+def _drawing(name: str, posteriors: Sequence[Posterior], adapter: Adapter) -> Drawing:
+    first = posteriors[0].observation
+    panels = [Panel(f"{after(0)}<br>&nbsp;", first, adapter.affordance(first, []))]
+    panels += [
         Panel(
-            f"{plain(f'{name} {each.label}' if each.label[0].isdigit() else each.label)}<br>{_successes(each)}",
+            f"{plain(each.label)}<br>{_successes(each)}",
             each.observation,
             each.affordance,
             tuple(tried(interaction) for interaction in each.history),
@@ -248,13 +57,3 @@ def _drawing(name: str, posteriors: Sequence[Posterior]) -> Drawing:
 def _successes(posterior: Posterior) -> str:
     count = sum(interaction.outcome.success for interaction in posterior.history)
     return f"{count} of {len(posterior.history)} tries succeeded"
-
-
-def _middle(interval: Range) -> float:
-    """The middle of what is drawn from: the geometric one where the logarithm is uniform."""
-    return sqrt(interval.low * interval.high) if interval.log else (interval.low + interval.high) / 2
-
-
-def _with(dynamics: HiddenDynamics, name: str, value: float) -> HiddenDynamics:
-    changes: dict[str, float] = {name: value}
-    return replace(dynamics, **changes)  # type: ignore[arg-type]

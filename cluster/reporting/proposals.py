@@ -5,9 +5,10 @@ import plotly.graph_objects as go
 
 from cluster.episodes import Episode
 from cluster.reporting.clouds import Panel, draw_panels, proposed, tried
-from cluster.reporting.page import Drawing, Section, plain
+from cluster.reporting.page import Drawing, Section, plain, shortened
+from cluster.reporting.words import after, hidden, verdict
 from shared.adaptation import Adapter, movable_points
-from shared.vocabulary import Direction, Float32, HiddenDynamics, Interaction, Observation
+from shared.vocabulary import Float32, Interaction, Observation
 
 MOST_TRIES = 3
 """Two clouds a step; a browser draws no more than about sixteen at once."""
@@ -20,31 +21,13 @@ def proposals_section(episode: Episode | None, adapter: Adapter) -> Section:
         return Section(key, title, ("No test object was tried by AIP.",))
     rollout, history = episode.rollout, episode.history[:MOST_TRIES]
     lead = (
-        f"{rollout.object.category} {rollout.object.id}, not seen in training; hidden: {hidden(rollout.dynamics)}. Of "
-        "the evaluation, the object whose affordance the tries changed the most.",
+        f"{shortened(rollout.object.category)} {rollout.object.id}, not seen in training; hidden: "
+        f"{hidden(rollout.dynamics)}. Of the evaluation, the object whose affordance the tries changed the most.",
         "Above: where AIP expects a try to tell most, from the least to the most of each cloud, and what it proposes "
         "there (black). Below: the affordance after that many tries, with the last of them (green: success, red: "
         "failure). Static parts are grey. Drag a cloud to turn all.",
     )
     return Section(key, title, lead, drawings=(Drawing(_figure(history, adapter), solid=True),))
-
-
-def hidden(dynamics: HiddenDynamics) -> str:
-    """Hidden dynamics in words."""
-    text = (
-        f"part mass {dynamics.part_mass:.2f} kg, joint friction {dynamics.joint_friction:.2f}, "
-        f"surface friction {dynamics.surface_friction:.2f}"
-    )
-    if dynamics.direction is Direction.AS_BUILT:
-        return text
-    return f"{text}, turns {'both ways' if dynamics.direction is Direction.BOTH else dynamics.direction.value}"
-
-
-def verdict(interaction: Interaction) -> str:
-    """What came of a try, in a few words."""
-    outcome = interaction.outcome
-    result = "success" if outcome.success else outcome.kind.value.replace("ok", "no success")
-    return f"{result}, moved {outcome.motion:.3f}"
 
 
 def _figure(history: list[Interaction], adapter: Adapter) -> go.Figure:
@@ -55,11 +38,11 @@ def _figure(history: list[Interaction], adapter: Adapter) -> go.Figure:
         before = history[:count]
         arrows = (proposed(history[count].action),) if count < len(history) else ()
         values = information(observation, before, adapter)
-        title = f"AIP, {_tries(count)}: at most {values[observation.movable].max():.2g}"
+        title = f"AIP, {after(count)}: at most {values[observation.movable].max():.2g}"
         title += f"<br>proposes try {count + 1}" if arrows else "<br>&nbsp;"
         above.append(Panel(title, observation, _stretched(values, observation), arrows))
         shown = observations[count - 1] if count else observation
-        title = f"affordance, {_tries(count)}<br>" + (plain(verdict(before[-1])) if before else "&nbsp;")
+        title = f"affordance, {after(count)}<br>" + (plain(verdict(before[-1].outcome)) if before else "&nbsp;")
         arrows = (tried(before[-1]),) if before else ()
         below.append(Panel(title, shown, adapter.affordance(shown, before), arrows, scale=1))
     return draw_panels([*above, *below], len(observations), ("AIP: least to most", "AAP: affordance"))
@@ -79,7 +62,3 @@ def _stretched(values: Float32, observation: Observation) -> Float32:
     low, high = own.min(initial=np.inf), own.max(initial=-np.inf)
     stretched: Float32 = (values - low) / max(high - low, 1e-12)
     return stretched
-
-
-def _tries(count: int) -> str:
-    return "before any try" if count == 0 else "after 1 try" if count == 1 else f"after {count} tries"

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,8 +19,12 @@ MAX_METRICS_BYTES = 16 << 20
 MAX_STAGES = 40
 COLUMNS = 4
 ROW_HEIGHT = 230
+AFTER_TRIES = (("bce", "cross entropy (nats)"), ("f_score", "F-score"))
+"""What AAP's validation says after each number of tries, by the beginning of its name."""
 
-Curve = Mapping[str, tuple[list[int], list[float]]]
+Entry = Mapping[str, float]
+"""A line of metrics: the finite numbers in it, "step" among them."""
+Curve = Mapping[str, tuple[list[float], list[float]]]
 """Steps and values by the name of what was measured."""
 
 
@@ -33,38 +38,64 @@ def training_section(folder: Path, order: Sequence[str]) -> Section:
     Raises:
         StoreError: a file is too large to be ours.
     """
-    curves = {name: read_metrics(path) for name, path in _metrics_files(folder, order).items()}
-    curves = {name: curve for name, curve in curves.items() if curve}
+    entries = {name: read_entries(path) for name, path in _metrics_files(folder, order).items()}
+    curves = {name: curve for name, each in entries.items() if (curve := curves_of(each))}
     if not curves:
         return Section("training", "Training", ("No stage of training left metrics.",))
     lead = (
         "Losses on the training rows, and the score on held-out objects by which the best weights are chosen, against "
         "steps: the lower, the better. Each stage starts from the weights of the one before.",
     )
-    return Section("training", "Training", lead, drawings=(_drawing(curves),))
+    last = {name: each[-1] for name, each in entries.items() if each}
+    known = {name: {kind: after_tries(entry, kind) for kind, _ in AFTER_TRIES} for name, entry in last.items()}
+    adapted = {name: each for name, each in known.items() if all(each.values())}
+    drawings = [_drawing(curves), *([_adaptation(adapted)] if adapted else [])]
+    return Section("training", "Training", lead, drawings=tuple(drawings))
 
 
-def read_metrics(path: Path) -> Curve:
-    """The losses and the score in a file of metrics; lines that a kill tore, or that are none of ours, are left out.
+def read_entries(path: Path) -> list[Entry]:
+    """The lines of a file of metrics; those that a kill tore, or that are none of ours, are left out.
 
     Raises:
         StoreError: the file is too large to be ours.
     """
-    curve: dict[str, tuple[list[int], list[float]]] = {}
+    entries = []
     for line in read_bounded(path, MAX_METRICS_BYTES).splitlines():
         try:
             entry = json.loads(line)
         except (ValueError, RecursionError):
             continue
-        if not isinstance(entry, dict) or not isinstance(entry.get("step"), int):
-            continue
+        if isinstance(entry, dict):
+            numbers = {name: number for name, value in entry.items() if math.isfinite(number := _number(value))}
+            if "step" in numbers:
+                entries.append(numbers)
+    return entries
+
+
+def _number(value: object) -> float:
+    """A number of JSON; NaN for what is none, or too large to be one."""
+    try:
+        return float(value) if isinstance(value, int | float) else math.nan
+    except OverflowError:
+        return math.nan
+
+
+def curves_of(entries: Sequence[Entry]) -> Curve:
+    """The losses and the score of a stage."""
+    curves: dict[str, tuple[list[float], list[float]]] = {}
+    for entry in entries:
         for name, value in entry.items():
-            shown = name == "score" or name.startswith("loss_")
-            if shown and isinstance(value, int | float) and math.isfinite(value):
-                steps, values = curve.setdefault(name, ([], []))
+            if name == "score" or name.startswith("loss_"):
+                steps, values = curves.setdefault(name, ([], []))
                 steps.append(entry["step"])
-                values.append(float(value))
-    return curve
+                values.append(value)
+    return curves
+
+
+def after_tries(entry: Entry, kind: str) -> list[tuple[int, float]]:
+    """What a validation measured after each number of tries, such as `bce_after_4`, by that number."""
+    matches = ((re.fullmatch(rf"{kind}_after_([0-9]{{1,4}})", name), value) for name, value in entry.items())
+    return sorted((int(match[1]), value) for match, value in matches if match)
 
 
 def _metrics_files(folder: Path, order: Sequence[str]) -> dict[str, Path]:
@@ -96,24 +127,43 @@ def _drawing(curves: Mapping[str, Curve]) -> Drawing:
     told: set[str] = set()
     for place, curve in enumerate(curves.values()):
         for name, (steps, values) in curve.items():
-            figure.add_trace(
-                go.Scatter(
-                    x=steps,
-                    y=values,
-                    name=plain("score (held out)" if name == "score" else name.replace("_", " ")),
-                    legendgroup=plain(name),
-                    showlegend=name not in told,
-                    mode="lines+markers" if len(steps) < 8 else "lines",
-                    line={"color": colours[name], "width": 2.4 if name == "score" else 1.4},
-                    marker={"size": 5},
-                    hovertemplate="step %{x}: %{y:.4f}",
-                ),
-                place // COLUMNS + 1,
-                place % COLUMNS + 1,
+            trace = go.Scatter(
+                x=steps,
+                y=values,
+                name=plain("score (held out)" if name == "score" else name.replace("_", " ")),
+                legendgroup=plain(name),
+                showlegend=name not in told,
+                mode="lines+markers" if len(steps) < 8 else "lines",
+                line={"color": colours[name], "width": 2.4 if name == "score" else 1.4},
+                marker={"size": 5},
+                hovertemplate="step %{x}: %{y:.4f}",
             )
+            figure.add_trace(trace, place // COLUMNS + 1, place % COLUMNS + 1)
             told.add(name)
     figure.update_annotations(font_size=13)
     figure.update_yaxes(nticks=5, exponentformat="e")
     figure.update_xaxes(nticks=5)
     legend = {"orientation": "h", "y": -0.28 / rows, "x": 0.5, "xanchor": "center", "yanchor": "top"}
     return Drawing(laid_out(figure, ROW_HEIGHT * rows + 90, legend=legend, margin={"l": 45, "r": 20, "t": 40, "b": 90}))
+
+
+def _adaptation(adapted: Mapping[str, Mapping[str, list[tuple[int, float]]]]) -> Drawing:
+    """What AAP knows of held-out objects after each number of random tries, at the end of each of its trainings."""
+    figure = make_subplots(1, 2, subplot_titles=[title for _, title in AFTER_TRIES], horizontal_spacing=0.09)
+    for place, (stage, known) in enumerate(adapted.items()):
+        for column, (kind, _) in enumerate(AFTER_TRIES, start=1):
+            trace = go.Scatter(
+                x=[tries for tries, _ in known[kind]],
+                y=[value for _, value in known[kind]],
+                name=plain(stage),
+                legendgroup=plain(stage),
+                showlegend=column == 1,
+                mode="lines+markers",
+                line={"color": SEQUENCE[place % len(SEQUENCE)], "width": 2},
+                marker={"size": 7},
+                hovertemplate="%{x} tries: %{y:.3f}",
+            )
+            figure.add_trace(trace, 1, column)
+    figure.update_xaxes(title_text="tries")
+    laid_out(figure, 340, showlegend=True, legend={"orientation": "h", "y": -0.25, "x": 0.5, "xanchor": "center"})
+    return Drawing(figure, "AAP's critic on held-out objects after so many random tries, at the end of its trainings.")

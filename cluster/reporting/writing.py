@@ -11,12 +11,8 @@ from cluster.evaluation_tables import RESULTS_FILE
 from cluster.ledger import Ledger
 from cluster.reporting.collecting import collection_section
 from cluster.reporting.failures import failures_section
-from cluster.reporting.hidden_facts import (
-    Laboratory,
-    first_readable,
-    hidden_facts_section,
-    hinge_twins,
-)
+from cluster.reporting.hidden_facts import hidden_facts_section
+from cluster.reporting.laboratory import Laboratory, first_readable, hinge_twins
 from cluster.reporting.page import Page, Picture, Section, render, shortened
 from cluster.reporting.proposals import proposals_section
 from cluster.reporting.results import Results, further_section, read_results, results_section, tiles

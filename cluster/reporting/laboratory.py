@@ -1,0 +1,207 @@
+"""Experiments on what cannot be seen: one hidden fact is varied, the same actions are tried, and affordance is adapted.
+
+What the camera sees is the same under every value, so that whatever differs afterwards was learnt from the tries.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from math import sqrt
+from pathlib import Path
+
+import numpy as np
+
+from cluster.reporting.words import turning
+from collector.articulation import ArticulatedObject
+from collector.catalogue import load_ref
+from collector.clock import StageClock
+from collector.environment import SapienEnvironment
+from collector.partnet import read_object
+from collector.procedural.assembly import normalised
+from collector.procedural.cabinets import storage_furniture
+from collector.procedural.writing import write_object
+from shared import seeds
+from shared.adaptation import Adapter
+from shared.configuration import Range
+from shared.errors import ObjectError
+from shared.geometry import camera_pose
+from shared.plan import ObjectRef, Setting
+from shared.proposers import proposer_named
+from shared.tasks import task_named
+from shared.vocabulary import Action, Direction, Float32, HiddenDynamics, Interaction, Observation
+
+TRIES = 4
+"""Actions that are tried under each value."""
+TRIED_BY = "fps"
+"""Who chooses them, with what comes of them under the first value: spread over what looks actionable."""
+OBJECTS_TRIED = 5
+"""Test objects that are looked at, at the most, for one that can still be read."""
+ELEVATION_DEG = 40.0
+CABINET_M = (1.0, 0.6, 1.2, 0.03)
+"""Width, depth, height and overhang of the cabinet that is hung on either side."""
+HINGED = "StorageFurniture"
+"""Its category."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One value of a hidden fact."""
+
+    label: str
+    target: ArticulatedObject
+    dynamics: HiddenDynamics
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """A hidden fact and the values that it takes."""
+
+    name: str
+    cases: tuple[Case, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """What the tries under one value taught."""
+
+    label: str
+    observation: Observation
+    history: tuple[Interaction, ...]
+    affordance: Float32
+
+
+class Laboratory:
+    """Where the experiments take place: a run's task, camera, fidelity and policy.
+
+    Args:
+        setting: of the run's evaluation.
+        adapter: its policy.
+    """
+
+    def __init__(self, setting: Setting, adapter: Adapter) -> None:
+        self.setting = setting
+        self.adapter = adapter
+        self.task = task_named(setting.task)
+
+    def posteriors(self, variation: Variation) -> list[Posterior]:
+        """The affordance under each value after the same tries; values under which nothing can be tried are skipped."""
+        found: list[Posterior] = []
+        actions: list[Action] = []
+        for case in variation.cases:
+            environment = self._environment(case)
+            if not environment.reset(self._rng("state")) or not environment.shows_a_target():
+                continue
+            if actions:
+                history = [self._try(environment, action) for action in actions]
+            else:
+                history = self._choose(environment)
+                actions = [interaction.action for interaction in history]
+            observation = history[0].observation
+            affordance = self.adapter.affordance(observation, history)
+            found.append(Posterior(case.label, observation, tuple(history), affordance))
+        return found
+
+    def _environment(self, case: Case) -> SapienEnvironment:
+        collection = self.setting.collection
+        middle = (collection.camera.azimuth_deg.low + collection.camera.azimuth_deg.high) / 2
+        return SapienEnvironment(
+            case.target,
+            self.task,
+            self.setting.terms.primitive,
+            case.dynamics,
+            camera_pose(middle, ELEVATION_DEG, collection.camera.distance),
+            collection.camera,
+            collection.fidelity,
+            self._rng("pixels"),
+            StageClock(),
+        )
+
+    def _choose(self, environment: SapienEnvironment) -> list[Interaction]:
+        proposer = proposer_named(TRIED_BY, self.adapter, self._rng("tries"), TRIES)
+        start, history = environment.state(), list[Interaction]()
+        for _ in range(TRIES):
+            environment.restore(start)
+            observation = environment.observe()
+            action = proposer.propose(observation, history)
+            if action is None:
+                break
+            history.append(Interaction(observation, action, environment.execute(action)))
+        environment.restore(start)
+        return history
+
+    def _try(self, environment: SapienEnvironment, action: Action) -> Interaction:
+        start = environment.state()
+        observation = environment.observe()
+        movable = np.flatnonzero(observation.movable)
+        nearest = movable[np.linalg.norm(observation.points[movable] - action.point, axis=1).argmin()]
+        here = replace(action, point_index=int(nearest))
+        outcome = environment.execute(here)
+        environment.restore(start)
+        return Interaction(observation, here, outcome)
+
+    def _rng(self, purpose: str) -> np.random.Generator:
+        """The same for every value, so that everything that is drawn is the same."""
+        return seeds.generator(self.setting.seed, f"report/{purpose}", 0)
+
+
+def variations(setting: Setting, target: ArticulatedObject, twins: Sequence[ArticulatedObject]) -> list[Variation]:
+    """What can be varied: three numbers of an object, its direction if the task hides it, and the side of a hinge.
+
+    Args:
+        setting: of the run's evaluation.
+        target: a test object.
+        twins: the same cabinet hung on its left and on its right; none where the task is not about doors.
+    """
+    ranges, task = setting.terms.dynamics, task_named(setting.task)
+    middle = HiddenDynamics(
+        part_mass=_middle(ranges.part_mass),
+        joint_friction=_middle(ranges.joint_friction),
+        surface_friction=_middle(ranges.surface_friction),
+        direction=task.directions[0],
+    )
+
+    def growing(name: str, interval: Range, changed: Callable[[float], HiddenDynamics]) -> Variation:
+        values = (interval.low, _middle(interval), interval.high)
+        return Variation(name, tuple(Case(f"{name} {value:.2g}", target, changed(value)) for value in values))
+
+    found = [
+        growing("joint friction", ranges.joint_friction, lambda value: replace(middle, joint_friction=value)),
+        growing("part mass", ranges.part_mass, lambda value: replace(middle, part_mass=value)),
+        growing("surface friction", ranges.surface_friction, lambda value: replace(middle, surface_friction=value)),
+    ]
+    if len(task.directions) > 1:
+        ways = tuple(Case(turning(way), target, replace(middle, direction=way)) for way in task.directions)
+        found.append(Variation("direction", ways))
+    if twins:
+        built = replace(middle, direction=Direction.AS_BUILT)
+        sides = zip(("hinge on the left", "hinge on the right"), twins, strict=True)
+        found.append(Variation("hinge side", tuple(Case(side, twin, built) for side, twin in sides)))
+    return found
+
+
+def hinge_twins(setting: Setting, folder: Path) -> list[ArticulatedObject]:
+    """One cabinet with a closed overlay door, hung on its left and on its right: no camera tells them apart.
+
+    Args:
+        setting: of the run's evaluation; tasks that are not about cabinets get none.
+        folder: where they are written.
+    """
+    categories = task_named(setting.task).categories
+    if categories and HINGED not in categories:
+        return []
+    left = write_object(folder / "left", normalised(storage_furniture("left", *CABINET_M)))
+    right = write_object(folder / "right", normalised(storage_furniture("right", *CABINET_M)))
+    return [read_object(left), read_object(right)]
+
+
+def first_readable(folder: Path, refs: Sequence[ObjectRef], setting: Setting) -> ArticulatedObject | None:
+    """The first of some test objects that can still be read; None where none of the first few can."""
+    for ref in refs[:OBJECTS_TRIED]:
+        with suppress(ObjectError):
+            return load_ref(folder, ref, setting.collection.collision)
+    return None
+
+
+def _middle(interval: Range) -> float:
+    """The middle of what is drawn from: the geometric one where the logarithm is uniform."""
+    return sqrt(interval.low * interval.high) if interval.log else (interval.low + interval.high) / 2

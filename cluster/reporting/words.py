@@ -1,0 +1,28 @@
+"""What the page calls things: hidden facts, outcomes, numbers of tries."""
+
+from shared.vocabulary import Direction, HiddenDynamics, Outcome
+
+
+def hidden(dynamics: HiddenDynamics) -> str:
+    """Hidden dynamics in words."""
+    text = (
+        f"part mass {dynamics.part_mass:.2f} kg, joint friction {dynamics.joint_friction:.2f}, "
+        f"surface friction {dynamics.surface_friction:.2f}"
+    )
+    return text if dynamics.direction is Direction.AS_BUILT else f"{text}, {turning(dynamics.direction)}"
+
+
+def turning(direction: Direction) -> str:
+    """Which way a joint turns."""
+    return "turns both ways" if direction is Direction.BOTH else f"turns {direction.value}"
+
+
+def verdict(outcome: Outcome) -> str:
+    """What came of a try, in a few words."""
+    result = "success" if outcome.success else outcome.kind.value.replace("ok", "no success")
+    return f"{result}, moved {outcome.motion:.3f}"
+
+
+def after(tries: int) -> str:
+    """When something is believed."""
+    return "before any try" if tries == 0 else "after 1 try" if tries == 1 else f"after {tries} tries"
