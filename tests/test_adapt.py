@@ -25,7 +25,7 @@ from shared.errors import AdaAffordError, StoreError, UsageError
 from shared.geometry import points_in_view
 from shared.networks.configuration import NetworkConfig
 from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
-from shared.vocabulary import Float, OutcomeKind
+from shared.vocabulary import Action, Float, OutcomeKind
 from tests.finished_run import make_finished_run
 
 NETWORK = NetworkConfig(
@@ -476,3 +476,17 @@ def test_a_robot_may_follow_line_by_line(policy_folder: Path, scan: Path) -> Non
     assert [first["tries"], second["tries"]] == [0, 1]
     assert second["seconds"] < 1
     assert [list(each) for each in refused] == [["error"]] * 2
+
+
+def test_the_example_of_the_readme_runs(policy_folder: Path) -> None:
+    text = (Path(__file__).parents[1] / "README.md").read_text()
+    example = text.split("```python\n")[1].split("```")[0]
+    assert '"pull-closed-door"' in example
+    names: dict[str, object] = {}
+    exec(example.replace('"pull-closed-door"', repr(str(policy_folder))), names)  # noqa: S102
+    heat, best, history = names["heat"], names["best"], names["history"]
+    assert isinstance(heat, np.ndarray)
+    assert heat.shape == (2048,)
+    assert isinstance(best, Action)
+    assert isinstance(history, list)
+    assert 1 <= len(history) <= 4
