@@ -21,6 +21,7 @@ from shared.errors import StoreError
 from shared.methods import METHODS, CriticName, method_named
 from shared.policy import Policy
 from shared.store.store import Store
+from shared.tasks import task_named
 from shared.vocabulary import Role
 
 PRIOR_METHOD = "where2act"
@@ -113,10 +114,10 @@ def evaluate(
         oracle: a critic that is told the hidden facts.
 
     Raises:
-        StoreError: there is no QUERY row, or the data set is of another task than a policy.
+        StoreError: there is no QUERY row, or the data set is of a task with another primitive than a policy's.
     """
     for policy in policies.values():
-        if policy.task != dataset.task:
+        if task_named(policy.task).primitive is not task_named(dataset.task).primitive:
             raise StoreError(f"the store is of task '{dataset.task}', but a policy of '{policy.task}'")
         policy.modules().eval()
     judge = _Judge(dataset, policies)
