@@ -16,8 +16,8 @@ import psutil
 from collector.articulation import ArticulatedObject
 from collector.clock import StageClock
 from collector.draws import object_of
-from collector.object_cache import ObjectCache
 from collector.guard import UnderWay
+from collector.object_cache import ObjectCache
 from collector.proposers import RandomProposer
 from collector.rollout import quarantined_rollout, run_rollout
 from shared.adaptation import Adapter
@@ -108,6 +108,9 @@ class Worker:
                 records.append(self.execute(plan, index, clock))
         under_way(None)
         provenance = {"host": platform.node(), "pid": str(os.getpid())}
+        if plan.policy_version:
+            # Beside the version in each row this says how far that was behind, where collection follows a learner.
+            provenance["newest_policy"] = str(max(self._store.policy_versions(), default=0))
         with clock.stage("write"):
             self._store.commit(plan, job, records, provenance, self._explain(job, quarantined))
         clock.seconds["total"] = time.perf_counter() - begun

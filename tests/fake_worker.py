@@ -62,7 +62,7 @@ class FakeWorker:
             {"ok": 4 * len(executed)},
             {"total": 0.01},
             len(quarantined),
-            5000.0 if self._take(f"grow-{job.start}") else 100.0,
+            5000.0 if self._take(f"grow-{job.start}", pause_s=0.0) else 100.0,
         )
 
     def _misbehave(self, rollout: int) -> None:
@@ -82,12 +82,12 @@ class FakeWorker:
         if self._take(f"refuse-{rollout}"):
             raise StoreError("the store is damaged")
 
-    def _take(self, name: str) -> bool:
-        """Whether to misbehave now."""
+    def _take(self, name: str, pause_s: float = 0.2) -> bool:
+        """Whether to misbehave now, and not before `pause_s`."""
         path = self.folder / name
         left = int(path.read_text()) if path.exists() else 0
         if left:
             path.write_text(str(left - 1))
             # A real worker takes seconds to begin; by then the actor's word that it is up has reached the driver.
-            time.sleep(0.2)
+            time.sleep(pause_s)
         return left > 0

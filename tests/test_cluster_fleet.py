@@ -13,7 +13,7 @@ import pytest
 
 from cluster.blame import MAX_FAULTS, MAX_LOSSES
 from cluster.fleet import Fleet, WorkerFactory
-from cluster.orders import Listed
+from cluster.orders import Listed, Order
 from cluster.session import fleets
 from collector.guard import Limits
 from shared.configuration import CollectionConfig
@@ -106,6 +106,40 @@ def test_a_fleet_goes_on_after_a_failed_run(fleet: Fleet, tmp_path: Path) -> Non
     with pytest.raises(StoreError):
         run(fleet, 3)
     assert run(fleet, 3) == [job.shard_id for job in jobs(3)]
+
+
+class Slow(Listed):
+    """Orders of which some are not there yet when they are asked for."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__(plan(), jobs(count))
+        self.asked = 0
+        self.taken = 0
+
+    def take(self) -> Order | None:
+        self.asked += 1
+        if self.asked % 2:
+            return None
+        self.taken += 1
+        return super().take()
+
+
+def test_orders_that_are_not_there_yet_are_asked_for_again(fleet: Fleet) -> None:
+    receipts: list[FakeReceipt] = []
+    fleet.run(Slow(5), receipts.append)
+    assert sorted(receipt.shard_id for receipt in receipts) == [job.shard_id for job in jobs(5)]
+
+
+def test_orders_are_taken_no_earlier_than_somebody_is_free_for_them(fleet: Fleet) -> None:
+    orders, done = Slow(12), 0
+
+    def count(receipt: FakeReceipt) -> None:
+        nonlocal done
+        done += 1
+        assert orders.taken <= done + 2 * fleet.workers
+
+    fleet.run(orders, count)
+    assert done == 12
 
 
 def test_weights_reach_the_live_workers_once_a_version(fleet: Fleet, tmp_path: Path) -> None:

@@ -21,11 +21,11 @@ from learner.curve import adaptation_curve, proposal_gains
 from learner.data import Dataset, Split, load_dataset
 from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
 from learner.frozen import FrozenAap
+from learner.names import METRICS_FILE
 from learner.oracle import OracleCritic
 from learner.prior import PriorStage
 from learner.sampling import Batch, ProposalPool, order_rows
 from learner.stages import DONE_FILE, StageJob, read_policy_folder, run_stage
-from learner.names import METRICS_FILE
 from learner.training import Stage, StepResult, train
 from shared.errors import UsageError
 from shared.policy import WEIGHTS_FILE, Policy

@@ -81,6 +81,16 @@ def test_more_names_than_one_page_are_listed(s3_url: str, monkeypatch: pytest.Mo
     assert len(place.leaves("shards")) == len(place.names("shards")) == 10
 
 
+def test_what_tells_of_the_moment_is_replaced_and_removed(place: Place) -> None:
+    for content in (b"first", b"", b"third and longer"):
+        place.replace("status/a.json", content)
+        assert place.read("status/a.json", 99) == content
+    assert place.names("status") == ["a.json"]
+    for _ in range(2):
+        place.remove("status/a.json")
+        assert not place.exists("status/a.json")
+
+
 def test_the_first_publisher_wins(place: Place) -> None:
     assert place.publish(publication({"x": b"1", "d/y": b"2"}))
     assert not place.publish(publication({"x": b"1", "d/y": b"2"}))
