@@ -11,6 +11,7 @@ from typing import Any
 
 from cluster.collection import Collected, OpenFleet, collect
 from cluster.training import run_child
+from shared.errors import UsageError
 from shared.methods import METHODS, versions_of
 from shared.plan import EvaluationConfig, Plan
 from shared.policy import Policy
@@ -60,11 +61,13 @@ class Evaluation:
             say: is told what the process that judges prints.
 
         Raises:
-            UsageError: a method needs networks that are not trained.
+            UsageError: a method needs networks that are not trained, or the store holds trials of another policy.
             WorkerError: a job or the judging failed.
         """
-        self._publish()
         plan = Plan(setting=self.store.setting, proposer=PROPOSER, policy_version=self.version)
+        if others := [other.key for other in self.store.plans() if other.key != plan.key]:
+            raise UsageError(f"{self.store.where}: holds trials of another policy ({others[0]}); name another folder")
+        self._publish()
         with self.store.only_driver():
             collected = collect(self.store, plan, self.rollouts, self.per_shard, open_fleet, self.objects)
             dismiss()

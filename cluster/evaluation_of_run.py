@@ -43,8 +43,8 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
         objects=refs,
         collection=task.resolve(config.collection),
         evaluation=EvaluationConfig(
-            methods=settings.methods or _possible_methods(policy),
-            budgets=settings.budgets,
+            methods=tuple(dict.fromkeys(settings.methods)) or _possible_methods(policy),
+            budgets=tuple(sorted(set(settings.budgets))),
             queries=settings.queries,
         ),
     )

@@ -4,6 +4,7 @@ from pydantic import Field
 
 from cluster.selection import ObjectSelection
 from shared.methods import MethodName
+from shared.plan import Budget
 
 
 class EvaluateSettings(ObjectSelection):
@@ -13,7 +14,7 @@ class EvaluateSettings(ObjectSelection):
     """Another task than the run's, of the same primitive."""
     methods: tuple[MethodName, ...] = ()
     """Which methods are compared; all whose networks the run has trained where none is named."""
-    budgets: tuple[int, ...] = (1, 2, 4)
+    budgets: tuple[Budget, ...] = Field((1, 2, 4), min_length=1)
     """After how many tries they are judged."""
     trials: int = Field(10, ge=1, le=100_000)
     """Trials an object: each draws hidden dynamics and a camera, tries and acts anew. As published: 10."""

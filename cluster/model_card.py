@@ -102,7 +102,7 @@ def _limits(config: CampaignConfig) -> str:
   fit into a ball of radius 1), seen from {camera.elevation_deg.low:g} to {camera.elevation_deg.high:g} deg above.
 - What is called a probability is one on objects like those of training, and on no others.
 - It knows neither reach nor safety: check poses, speeds and forces before an arm moves.
-- Half precision: scores differ from those of the trained weights by about 0.001."""
+- Half precision: scores differ from those of the trained weights by less than 0.001."""
 
 
 def _use(policy: Policy) -> str:

@@ -6,7 +6,7 @@ range of a plan's rollouts and makes one *shard*. Nothing here knows who does th
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -23,11 +23,15 @@ class ObjectRef(StrictModel):
     content_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
+Budget = Annotated[int, Field(ge=1, le=64)]
+"""A number of tries."""
+
+
 class EvaluationConfig(StrictModel):
     """What is tried on each test object."""
 
     methods: tuple[MethodName, ...] = ("where2act", "ours-random", "ours-final")
-    budgets: tuple[int, ...] = (1, 2, 4)
+    budgets: tuple[Budget, ...] = Field((1, 2, 4), min_length=1)
     queries: int = Field(24, ge=1)
     """Random test interactions a rollout, which critics are asked about (F-score)."""
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cluster.blame import JobError
 from cluster.cli import run as adaafford
-from cluster.evaluation import Evaluation
+from cluster.evaluation import PROPOSER, Evaluation
 from cluster.evaluation_of_run import evaluate_run
 from cluster.evaluation_settings import EvaluateSettings
 from cluster.evaluation_tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, Table, as_csv, as_markdown
@@ -22,6 +22,7 @@ from learner.bootstrap import ratio_interval
 from learner.metrics import f_score
 from shared.errors import UsageError
 from shared.methods import METHODS
+from shared.plan import EvaluationConfig, Plan, Setting
 from shared.store import Store
 from tests.finished_run import make_finished_run
 
@@ -111,6 +112,16 @@ def test_missing_networks_are_refused_before_anything_is_tried(finished: Path, t
     assert Store.open(tmp_path / "out" / "store").committed() == []
 
 
+def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) -> None:
+    store = Store.open(finished / "store")
+    told = {**dict(store.setting), "kind": "evaluation", "evaluation": EvaluationConfig(methods=("where2act",))}
+    evaluation = Store.create(tmp_path / "store", Setting(**told))
+    evaluation.add_plan(Plan(setting=evaluation.setting, proposer=PROPOSER, policy_version=7))
+    wanted = Evaluation(evaluation, store, 1, 2, 1, finished / "objects", tmp_path, tmp_path)
+    with pytest.raises(UsageError, match="trials of another policy"):
+        wanted.execute(lambda: pytest.fail("a fleet was asked for"), lambda: None, print)
+
+
 def test_what_does_not_suit_is_refused_in_one_line(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,6 +130,7 @@ def test_what_does_not_suit_is_refused_in_one_line(
         (["--run", str(tmp_path / "gone")], "holds no run"),
         (["--run", str(finished), "--policy", "7"], "there is no policy 7; published: 1"),
         (["--run", str(finished), "--task", "pull"], "the run is trained to push"),
+        (["--run", str(finished), "--budgets", "0"], "budgets"),
         (["--run", str(finished), "--task", "pusk"], "unknown task 'pusk'"),
         (["--run", str(finished), "--objects", str(tmp_path / "boxes")], "suits the task 'push-faucet'"),
     ):
