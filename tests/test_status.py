@@ -178,10 +178,12 @@ def test_text_from_files_is_no_markup(tmp_path: Path) -> None:
     from rich.console import Console
 
     store = fill(str(tmp_path / "store"))
-    written(store, status_of().model_copy(update={"title": "[red]aip[/]"}))
+    written(store, status_of().model_copy(update={"title": "[red]aip[/]\x1b]0;owned\x07"}))
     console = Console(record=True, width=200, file=io.StringIO())
     console.print(table(standing_of(store.where), 1000.0))
-    assert "[red]aip[/]" in console.export_text()
+    text = console.export_text()
+    assert "[red]aip[/]" in text
+    assert "\x1b" not in text and "\x07" not in text
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 20.0), st.integers(0, 100)), max_size=20))

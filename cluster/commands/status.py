@@ -92,10 +92,11 @@ def table(standing: "Standing", now: float) -> "Table":
     shown = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
 
     def row(name: str, value: str) -> None:
-        # As plain text: names of files and reasons may hold what rich takes for markup.
-        shown.add_row(Text(name, style="dim"), Text(value))
+        # As plain text: names and files may hold what rich takes for markup, or a terminal for commands.
+        shown.add_row(Text(name, style="dim"), Text("".join(filter(str.isprintable, value))))
 
-    row(standing.what, standing.where)
+    if standing.what != "store":
+        row(standing.what, standing.where)
     if standing.what == "run":
         row("stages done", ", ".join(standing.stages_done) or "none")
         row("stage", f"{standing.stage}, {_duration(standing.stage_s)}" if standing.stage else "none under way")
