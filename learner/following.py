@@ -65,21 +65,28 @@ class Following:
         self._pace = pace
         self._sleep = sleep
         self._store = self._wait_for_store(store)
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"--out {out}: cannot be made ({error.strerror}); choose another folder") from None
 
     def data(self, job: StageJob, number: int) -> StageJob:
-        """The job with what the store holds, once that is enough; the prior learns from what round 1 does."""
-        round_number = max(number, 1)
-        path = self._out / f"data-{round_number}.json"
-        if sharing.rank() == 0 and not path.exists():
-            self._out.mkdir(parents=True, exist_ok=True)
-            found = self._wait_for_rollouts(round_number)
-            write_atomically(path, found.model_dump_json().encode())
-        while not path.exists():
-            # Not a barrier, which would lose patience: collection may take hours.
-            self._sleep(self._pace.poll_s)
+        """The job with what the store holds, once that is enough; the prior learns from what round 1 does.
+
+        Raises:
+            UsageError: the learner's folder cannot be made.
+            StoreError: the store is damaged.
+        """
+        number = max(number, 1)
         if job.train_objects is None and job.validation_objects is None:
             named = [ref.id for ref in self._store.setting.objects]
             job = replace(job, validation_objects=kept_for_validation(named))
+        path = self._out / f"data-{number}.json"
+        if sharing.rank() == 0 and not path.exists():
+            write_atomically(path, self._wait_for_rollouts(job, number).model_dump_json().encode())
+        while not path.exists():
+            # Not a barrier, which would lose patience: collection may take hours.
+            self._sleep(self._pace.poll_s)
         return replace(job, snapshot=_read_snapshot(path))
 
     def done(self, number: int, policy: Path) -> None:
@@ -95,7 +102,7 @@ class Following:
             self._sleep(self._pace.poll_s)
         return Store.open(where)
 
-    def _wait_for_rollouts(self, number: int) -> Snapshot:
+    def _wait_for_rollouts(self, job: StageJob, number: int) -> Snapshot:
         """What the store holds once that is enough for the round."""
         before = 0 if number == 1 else _read_snapshot(self._out / f"data-{number - 1}.json").rollouts
         wanted = self._pace.first if number == 1 else before + self._pace.more
@@ -105,13 +112,22 @@ class Following:
             if there >= wanted:
                 snapshot = Snapshot.of(self._store.parts())
                 there = snapshot.rollouts
-                if there >= wanted:
+                if there >= wanted and self._has_both_sides(snapshot, job):
                     return snapshot
             if time.monotonic() - said_at >= LINE_S:
                 said_at = time.monotonic()
-                where = self._store.where
-                print(f"round {number} waits for {wanted} rollouts in {where}; {there} are there", flush=True)
+                what = f"{wanted} rollouts" if there < wanted else "objects to learn from and others to judge by"
+                print(f"round {number} waits for {what} in {self._store.where}; {there} rollouts are there", flush=True)
             self._sleep(self._pace.poll_s)
+
+    def _has_both_sides(self, snapshot: Snapshot, job: StageJob) -> bool:
+        """Whether something was tried on objects to learn from, and on objects to judge by."""
+        rows = self._store.as_of(snapshot).interactions(["object_id"])
+        objects = set(rows.column("object_id").unique().to_pylist())
+        train, validation = job.train_objects, job.validation_objects
+        learnt_from = objects - set(validation or ()) if train is None else objects & set(train)
+        judged_by = objects - set(train or ()) if validation is None else objects & set(validation)
+        return bool(learnt_from and judged_by)
 
     def _at_most(self) -> int:
         """The most rollouts that the store can hold, by the names of its shards alone: cheap, so it is asked first."""

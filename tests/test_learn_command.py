@@ -100,6 +100,26 @@ def test_validation_objects_stay_what_they_are_while_objects_come(followed: tupl
         assert not {dataset.objects[each] for each in parts.train} & kept
 
 
+def test_enough_is_also_something_to_judge_by(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "store", PLAN.setting)
+    (kept,) = kept_for_validation(ref.id for ref in PLAN.setting.objects)
+    number = next(k for k, ref in enumerate(PLAN.setting.objects) if ref.id == kept)
+    others = [k for k in range(4) if k != number]
+    for k in others:
+        commit(store, k, k + 1)
+    slept: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        commit(store, number, number + 1)
+
+    following = Following(store.where, tmp_path / "out", Pace(first=3, more=1), sleep)
+    job = following.data(StageJob("prior", store.where, tmp_path / "out"), 1)
+    assert len(slept) == 1
+    assert job.snapshot is not None and job.snapshot.rollouts == 4
+    assert job.validation_objects == {kept}
+
+
 def test_a_policy_is_published_once_under_the_next_free_version(tmp_path: Path) -> None:
     store = Store.create(tmp_path / "store", PLAN.setting)
     store.publish_policy(1, {WEIGHTS_FILE: b"of another learner"})
