@@ -20,12 +20,13 @@ from adaafford.pretrained import load_policy, only_pretrained, pretrained_names
 from adaafford.scans import ScanFrame, action_at, checked_scan, observation_of, read_scan
 from adaafford.sessions import Session, SessionFiles, Step
 from cluster.cli import run as adaafford
-from shared.adaptation import Adapter
+from shared.adaptation import Adapter, frames_in_view
 from shared.errors import AdaAffordError, StoreError, UsageError
-from shared.geometry import points_in_view
+from shared.geometry import camera_pose, gripper_rotation, points_in_view
 from shared.networks.configuration import NetworkConfig
 from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.vocabulary import Action, Float, OutcomeKind
+from tests.fabricate import fabricate_observation
 from tests.finished_run import make_finished_run
 
 NETWORK = NetworkConfig(
@@ -490,3 +491,23 @@ def test_the_example_of_the_readme_runs(policy_folder: Path) -> None:
     assert isinstance(best, Action)
     assert isinstance(history, list)
     assert 1 <= len(history) <= 4
+
+
+def test_a_simulated_view_that_comes_as_a_scan_shows_networks_the_same() -> None:
+    """From the simulator's world through a file's frame and back, in whatever frame the file is."""
+    rng = np.random.default_rng(4)
+    seen = fabricate_observation(rng, 2048, camera_pose(170.0, 40.0, 5.0), parts=2)
+    turn = gripper_rotation(np.array([0.0, 0.6, 0.8]), np.array([1.0, 0.0, 0.0]))
+    offset = np.array([2.0, -1.0, 0.5])
+    camera, up = turn @ seen.world_from_camera[:3, 3] + offset, turn[:, 2]
+    scan = checked_scan(seen.points @ turn.T + offset, seen.normals @ turn.T, seen.movable)
+    frame = ScanFrame(up=tuple(up.tolist()), camera=tuple(camera.tolist()), origin=tuple(offset.tolist()))
+    read = observation_of(scan, frame)
+    np.testing.assert_allclose(points_in_view(read), points_in_view(seen)[read.pixels], atol=1e-3)
+    assert (read.movable == seen.movable[read.pixels]).all()
+    rotation = gripper_rotation(np.array([0.8, 0.0, -0.6]), rng.normal(size=3))
+    action = Action(7, seen.points[7].astype(np.float64), rotation)
+    point, approach, forward = (turn @ action.point + offset, turn @ action.approach, turn @ action.forward)
+    again = action_at(read, frame, tuple(point), tuple(approach), tuple(forward))
+    assert read.pixels[again.point_index] == 7
+    np.testing.assert_allclose(frames_in_view(read, [again]), frames_in_view(seen, [action]), atol=1e-6)
