@@ -65,16 +65,12 @@ class Following:
         self._pace = pace
         self._sleep = sleep
         self._store = self._wait_for_store(store)
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"--out {out}: cannot be made ({error.strerror}); choose another folder") from None
+        out.mkdir(parents=True, exist_ok=True)
 
     def data(self, job: StageJob, number: int) -> StageJob:
         """The job with what the store holds, once that is enough; the prior learns from what round 1 does.
 
         Raises:
-            UsageError: the learner's folder cannot be made.
             StoreError: the store is damaged.
         """
         number = max(number, 1)
@@ -145,16 +141,18 @@ def publish(store: Store, out: Path, name: str, policy: Path) -> int | None:
         policy: folder of the stage that made it.
 
     Raises:
-        StoreError: the store has another policy of that version by now, or the record is damaged.
+        StoreError: another learner took that version at this very moment, or the record is damaged.
     """
     if sharing.rank() > 0:
         return None
-    versions = _published(out)
-    if name not in versions:
-        # Noted first: after a kill the same policy goes to the same version, where it may lie already.
-        versions[name] = max(store.policy_versions(), default=0) + 1
-        write_atomically(out / PUBLISHED_FILE, json.dumps(versions, indent=1).encode())
+    versions, taken = _published(out), store.policy_versions()
     files = {file: read_bounded(policy / file, MAX_WEIGHTS_BYTES) for file in (WEIGHTS_FILE, POLICY_FILE)}
+    noted = versions.get(name)
+    if noted is None or (noted in taken and store.read_policy(noted) != files):
+        # Noted first: after a kill the same policy goes to the same version, where it may lie already, unless another
+        # learner has taken that one since.
+        versions[name] = max(taken, default=0) + 1
+        write_atomically(out / PUBLISHED_FILE, json.dumps(versions, indent=1).encode())
     store.publish_policy(versions[name], files)
     print(f"{store.where}: policy {versions[name]} is {policy}", flush=True)
     return versions[name]

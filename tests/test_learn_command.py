@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cluster.cli import run
+from cluster.locking import only_driver
 from cluster.training import as_toml
 from learner.alternation import alternate
 from learner.configuration import AlternationConfig
@@ -130,8 +131,8 @@ def test_a_policy_is_published_once_under_the_next_free_version(tmp_path: Path) 
     assert [publish(store, tmp_path, name, tmp_path / name) for name in ("a", "b", "a")] == [2, 3, 2]
     # Killed between the note and the publication, while another learner took the version.
     (tmp_path / PUBLISHED_FILE).write_text(json.dumps({"a": 1}))
-    with pytest.raises(StoreError, match="exists with other content"):
-        publish(store, tmp_path, "a", tmp_path / "a")
+    assert publish(store, tmp_path, "a", tmp_path / "a") == 4
+    assert store.read_policy(4)[WEIGHTS_FILE] == b"a"
     (tmp_path / PUBLISHED_FILE).write_text("[")
     with pytest.raises(StoreError, match="damaged"):
         publish(store, tmp_path, "a", tmp_path / "a")
@@ -149,6 +150,16 @@ def test_the_command_learns_from_a_finished_store_in_a_bucket_and_publishes_the_
         assert run(arguments) == 0
         assert store.policy_versions() == (1,)
     assert store.read_policy(1)[WEIGHTS_FILE] == (tmp_path / "out" / "aip-1" / WEIGHTS_FILE).read_bytes()
+
+
+def test_a_second_learner_in_the_same_folder_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with only_driver(tmp_path / "out"):
+        assert run(["learn", "--store", str(tmp_path / "store"), "--out", str(tmp_path / "out"), "--follow"]) == 2
+    assert "is in use by process" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert run(["learn", "--store", "s", "--out", str(tmp_path / "file" / "out"), "--follow"]) == 2
+    assert "cannot be made" in capsys.readouterr().err
 
 
 def test_nothing_to_wait_for_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """`adaafford learn`: the learner as a process of its own, beside collection; needs neither Ray nor SAPIEN."""
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -54,6 +55,8 @@ def main(args: list[str]) -> int:
 
 
 def _learn(command: LearnCommand) -> None:
+    from cluster.locking import only_driver
+    from learner import sharing
     from learner.alternation import Finished, alternate
     from learner.data import read_object_list
     from learner.following import Following, Pace, publish
@@ -68,7 +71,11 @@ def _learn(command: LearnCommand) -> None:
         train_objects=read_object_list(command.train_objects),
         validation_objects=read_object_list(command.validation_objects),
     )
-    with hardware(command.settings) as used:
+    with ExitStack() as stack:
+        used = stack.enter_context(hardware(command.settings))
+        if sharing.rank() == 0:
+            _make_folder(command.out)
+            stack.enter_context(only_driver(command.out))
         if command.follow:
             pace = Pace(command.first_rollouts, command.more_rollouts, command.poll_s)
             alternate(job, command.settings, used, Following(command.store, command.out, pace))
@@ -76,3 +83,10 @@ def _learn(command: LearnCommand) -> None:
         store = Store.open(command.store)
         best = alternate(job, command.settings, used, Finished(store))
         publish(store, command.out, "best", best.folder)
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"--out {path}: cannot be made ({error.strerror}); choose another folder") from None
