@@ -115,12 +115,12 @@ class ScanFrame(StrictModel):
         return world
 
     def point_to_scan(self, point: Float) -> Float:
-        """A point of the world, [3], in the scan's frame."""
+        """Points of the world, [..., 3], in the scan's frame."""
         found: Float = point @ self.world_from_scan + self.origin
         return found
 
     def direction_to_scan(self, direction: Float) -> Float:
-        """A direction of the world, [3], in the scan's frame."""
+        """Directions of the world, [..., 3], in the scan's frame."""
         found: Float = direction @ self.world_from_scan
         return found
 

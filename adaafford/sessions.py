@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from pydantic import Field, ValidationError
 
 from adaafford.heatmaps import heatmap_writer, write_heatmap
@@ -131,7 +130,7 @@ class Session:
             assert action is not None, "an exploiter never stops"
         if self._files.heatmap is not None:
             heat = self._adapter.affordance(observation, known)
-            places = np.stack([history.frame.point_to_scan(p) for p in observation.points.astype(np.float64)])
+            places = history.frame.point_to_scan(observation.points.astype(np.float64))
             write_heatmap(self._files.heatmap, places, heat, observation.pixels)
         history = history.proposing(action, name)
         write_history(self._files.history, history)
