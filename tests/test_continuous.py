@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cluster.cli import run
 from cluster.collection import Newest, collect
+from cluster.commands.collect import CollectCommand
 from cluster.fleet import SerialFleet
 from cluster.in_force import LOOK_S, PlanInForce
 from cluster.orders import Series
@@ -193,3 +195,39 @@ def test_the_driver_writes_down_how_it_stands(store: Store) -> None:
     status = read_status(store.place)
     assert status is not None and (status.state, status.done, status.rollouts) == ("done", 8, 4)
     assert verify(store) == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "policy"),
+    [
+        (["--proposer", "aip", "--policy", "2"], 2),
+        (["--proposer", "aip", "--policy", "latest"], "latest"),
+        (["--proposer", "aip", "--policy", "latest", "--per-version", "5"], "latest"),
+        ([], 0),
+    ],
+)
+def test_a_policy_is_a_version_or_the_latest(
+    flags: list[str], policy: int | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    understood: list[CollectCommand] = []
+    monkeypatch.setattr("cluster.commands.collect._collect", understood.append)
+    assert run(["collect", "--store", "S", *flags]) == 0
+    assert understood[0].policy == policy
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--proposer", "aip"],
+        ["--policy", "latest"],
+        ["--proposer", "aip", "--policy", "-1"],
+        ["--proposer", "aip", "--policy", "2", "--per-version", "5"],
+        ["--per-version", "5"],
+        ["--proposer", "aip", "--policy", "latest", "--per-version", "0"],
+    ],
+)
+def test_policies_that_make_no_sense_are_refused_in_one_line(
+    flags: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["collect", "--store", "S", *flags]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

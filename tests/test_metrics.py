@@ -1,7 +1,7 @@
 """Metrics count what receipts say, under labels that are few whatever is collected."""
 
 from collections import Counter as Tally
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -18,7 +18,7 @@ PLAN = Plan(setting=fabricate_setting(), proposer="aip", policy_version=3)
 class Recorded:
     """What was counted, of all metrics."""
 
-    values: Tally[tuple[str, ...]] = Tally()
+    values: ClassVar[Tally[tuple[str, ...]]] = Tally()
 
     def __init__(self, name: str, description: str, tag_keys: tuple[str, ...] = ()) -> None:
         assert name.startswith("adaafford_") and description.endswith(".")
