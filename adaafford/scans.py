@@ -32,6 +32,8 @@ from shared.vocabulary import Action, Float, Observation
 
 MAX_SCAN_BYTES = 128 << 20
 MIN_POINTS, MAX_POINTS = 64, 1920 * 1080
+POINTS, CANDIDATES = CameraConfig().points, CameraConfig().candidates
+"""Kept of a scan, and drawn before that, as in training unless that was told otherwise."""
 MAX_EXTENT_M = 10.0
 """No object that a hand opens is larger; clouds in millimetres are."""
 MAX_OFF_CLOUD_M = 0.05
@@ -197,28 +199,33 @@ def checked_scan(
     )
 
 
-def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0) -> Observation:
-    """What a policy is shown of a scan: as many points as in training, thinned and rounded likewise.
+def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = POINTS) -> Observation:
+    """What a policy is shown of a scan, thinned and rounded as in training.
+
+    Args:
+        scan: as it was taken.
+        frame: how it lies in the world.
+        seed: of what is drawn where there are many points.
+        points: N; as many as the policy was trained with.
 
     Raises:
         UsageError: no point that is kept may be acted upon, or the camera stands in the object.
     """
-    camera, world_from_camera = CameraConfig(), frame.world_from_camera
-    rng = seeds.generator(seed, "scan")
-    kept = furthest_first(scan.points, camera.points, camera.candidates, rng)
-    points = frame.to_world(scan.points[kept])
-    if np.abs(points).max() > 2 * MAX_EXTENT_M:
+    world_from_camera, rng = frame.world_from_camera, seeds.generator(seed, "scan")
+    kept = furthest_first(scan.points, points, max(CANDIDATES, points), rng)
+    places = frame.to_world(scan.points[kept])
+    if np.abs(places).max() > 2 * MAX_EXTENT_M:
         raise UsageError("the cloud lies far from the origin of its frame; all scans of a history share one frame")
     if scan.normals is not None:
         normals = scan.normals[kept] @ frame.world_from_scan.T
     else:
-        normals = _estimated_normals(frame.to_world(scan.points), points)
+        normals = _estimated_normals(frame.to_world(scan.points), places)
     movable = np.ones(len(kept), dtype=bool) if scan.movable is None else scan.movable[kept]
     if not movable.any():
         raise UsageError("the cloud has no movable point; look from another side, or mark the points to act on")
     return Observation(
-        points=round_points(points),
-        normals=round_normals(_facing(normals, points, world_from_camera[:3, 3])),
+        points=round_points(places),
+        normals=round_normals(_facing(normals, places, world_from_camera[:3, 3])),
         part_ids=movable.astype(np.uint8),
         movable=movable,
         pixels=kept.astype(np.uint32),

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 
 from adaafford.heatmaps import heatmap_writer, write_heatmap
 from adaafford.histories import History, TriedOutcome, read_history, write_history
-from adaafford.scans import ScanFrame, Vector, observation_of, read_scan
+from adaafford.scans import POINTS, ScanFrame, Vector, observation_of, read_scan
 from shared import seeds
 from shared.adaptation import Adapter
 from shared.configuration import StrictModel
@@ -88,6 +88,7 @@ class Session:
         seed: of what is drawn; a step that is asked for again is the same.
         up: against gravity, in the frame of the scans; the history's where there is one, else 0 0 1.
         camera: where the camera stood, likewise; else what the first scan says, else 0 0 0.
+        points: how many of a scan the policy is shown.
     """
 
     def __init__(
@@ -98,12 +99,14 @@ class Session:
         seed: int = 0,
         up: Vector | None = None,
         camera: Vector | None = None,
+        points: int = POINTS,
     ) -> None:
         policy.require("prior", "aap", "aip")
         if files.heatmap is not None:
             heatmap_writer(files.heatmap)
         self._adapter = Adapter(policy)
-        self._files, self._budget, self._seed, self._up, self._camera = files, budget, seed, up, camera
+        self._files, self._budget, self._seed, self._points = files, budget, seed, points
+        self._up, self._camera = up, camera
         self._observations: dict[str, Observation] = {}
 
     def step(self, cloud: Path, outcome: TriedOutcome | None = None) -> Step:
@@ -175,5 +178,6 @@ class Session:
     def _observe(self, name: str, frame: ScanFrame) -> Observation:
         """The observation of a cloud, made once, since the networks' work on it is remembered with it."""
         if name not in self._observations:
-            self._observations[name] = observation_of(read_scan(self._files.history.parent / name), frame, self._seed)
+            scan = read_scan(self._files.history.parent / name)
+            self._observations[name] = observation_of(scan, frame, self._seed, self._points)
         return self._observations[name]

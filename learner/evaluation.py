@@ -157,10 +157,10 @@ class _Judge:
         if not sum(map(len, self.queries)):
             raise StoreError("the store holds no query to judge by; evaluate on a store made by an evaluation plan")
         self._critics: dict[tuple[CriticName, int], RowCritic] = {}
-        objects = sorted(set(dataset.objects))
+        numbers = {name: number for number, name in enumerate(sorted(set(dataset.objects)))}
         self._object_of = np.zeros(len(rows.success), dtype=np.int64)
         for index, name in zip(dataset.rollouts, dataset.objects, strict=True):
-            self._object_of[index.numpy()] = objects.index(name)
+            self._object_of[index.numpy()] = numbers[name]
 
     def critic(self, name: CriticName, version: int) -> RowCritic:
         """A critic of a policy, made once for all methods that share it."""

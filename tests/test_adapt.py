@@ -460,6 +460,7 @@ def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
         (["--kind", "no-grasp"], "give --outcome MOTION"),
         (["--out", "heat.obj"], "not a kind of heatmap"),
         (["--budget", "0"], "at least one try"),
+        (["--points", "9"], "allowed are 64 to 16384"),
     ):
         assert adaafford(["adapt", *where, *wrong]) == 2
         line = capsys.readouterr().err

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from adaafford.sessions import Session
 
 MAX_LINE_BYTES = 1 << 16
+MIN_SHOWN, MAX_SHOWN = 64, 16384
+"""Of a scan's points, as in the configuration of the simulated camera."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,8 @@ class AdaptCommand:
     """Where the camera stood in the scan's frame: 0 0 0 where neither this nor the scan nor the history says."""
     budget: int = 4
     """How many tries may be proposed before it says how to act."""
+    points: int = 2048
+    """How many points of a scan the policy is shown: as many as it was trained with, which its card says."""
     seed: int = 0
     """Of what is drawn."""
     follow: bool = False
@@ -61,6 +65,10 @@ def main(args: list[str]) -> int:
         raise UsageError("--success and --kind say how an outcome is meant; give --outcome MOTION with them")
     if command.budget < 1:
         raise UsageError(f"--budget {command.budget}: at least one try is needed to adapt")
+    if not MIN_SHOWN <= command.points <= MAX_SHOWN:
+        raise UsageError(f"--points {command.points}: allowed are {MIN_SHOWN} to {MAX_SHOWN}")
+    if command.seed < 0:
+        raise UsageError(f"--seed {command.seed}: needs a number that is not negative")
     from adaafford.histories import TriedOutcome
     from adaafford.pretrained import load_policy, only_pretrained
     from adaafford.sessions import Session, SessionFiles
@@ -68,7 +76,7 @@ def main(args: list[str]) -> int:
 
     files = SessionFiles(command.history, command.out or command.history.parent / "heatmap.ply")
     policy = load_policy(command.policy or only_pretrained())
-    session = Session(policy, files, command.budget, command.seed, command.up, command.camera)
+    session = Session(policy, files, command.budget, command.seed, command.up, command.camera, command.points)
     told = {"motion": command.outcome, "success": command.success, "kind": command.kind}
     outcome = None if command.outcome is None else parse(TriedOutcome, told, "--outcome")
     print(session.step(command.cloud, outcome).model_dump_json(), flush=True)
