@@ -1,6 +1,7 @@
 """Evaluation by itself: intervals are honest, tables say what was found, and a stop changes nothing."""
 
 import csv
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -16,9 +17,11 @@ from cluster.evaluation import PROPOSER, Evaluation
 from cluster.evaluation_of_run import evaluate_run
 from cluster.evaluation_settings import EvaluateSettings
 from cluster.evaluation_tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, Table, as_csv, as_markdown
+from cluster.judging import judge
 from collector.procedural.writing import generate
 from collector.worker import Worker
 from learner.bootstrap import ratio_interval
+from learner.evaluation import EvaluationRow
 from learner.metrics import f_score
 from shared.errors import UsageError
 from shared.methods import METHODS
@@ -120,6 +123,27 @@ def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) 
     wanted = Evaluation(evaluation, store, 1, 2, 1, finished / "objects", tmp_path, tmp_path)
     with pytest.raises(UsageError, match="trials of another policy"):
         wanted.execute(lambda: pytest.fail("a fleet was asked for"), lambda: None, print)
+
+
+def row_of(method: str, budget: int, f_score: float) -> EvaluationRow:
+    figures = dict.fromkeys((field.name for field in dataclasses.fields(EvaluationRow)), 0.5)
+    return EvaluationRow(**figures | {"method": method, "budget": budget, "f_score": f_score})  # type: ignore[arg-type]
+
+
+def test_where2act_stands_at_every_budget_and_the_oracle_closes_the_gap(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store.open(finished / "store")
+    told = {**dict(store.setting), "kind": "evaluation", "evaluation": EvaluationConfig(budgets=(1, 4))}
+    evaluation = Store.create(tmp_path / "store", Setting(**told))
+    evaluation.publish_policy(1, store.read_policy(1))
+    rows = [row_of("where2act", 0, 0.2), row_of("oracle", 0, 0.7), row_of("ours-final", 4, 0.6)]
+    no_gap = [*rows[::2], row_of("oracle", 0, 0.1)]
+    for known, closed in ((rows, {0.0, 1.0, 0.8}), (rows[::2], {None}), (no_gap, {None})):
+        monkeypatch.setattr("cluster.judging.evaluate_store", lambda *_, known=known: known)
+        table = judge(evaluation, 1, tmp_path / "no-oracle")
+        assert [row["budget"] for row in table.rows if row["method"] == "where2act"] == [1, 4]
+        assert {row["gap_closed"] and round(row["gap_closed"], 9) for row in table.rows} == closed
 
 
 def test_what_does_not_suit_is_refused_in_one_line(
