@@ -15,10 +15,11 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import field_validator
+from pydantic import Field, field_validator
 from scipy.spatial import cKDTree
 
 from adaafford.pcd import read_pcd
@@ -46,7 +47,10 @@ UNREADABLE: tuple[type[Exception], ...] = (
 """What parsers raise when bytes are not what they pretend to be."""
 _NORMAL_NEIGHBOURS = 16
 
-Vector = tuple[float, float, float]
+MAX_COORDINATE = 1e4
+"""Of places, metres, and of the numbers of a normal."""
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,11 +180,12 @@ def checked_scan(
     for name, value, shape in (("normals", facing, places.shape), ("movable", allowed, places.shape[:1])):
         if value is not None and value.shape != shape:
             raise UsageError(f"{source}: needs {name} of shape {shape}, like its points; given {value.shape}")
-    if stood is not None and (stood.shape != (3,) or not np.isfinite(stood).all()):
-        raise UsageError(f"{source}: needs a camera of three finite numbers")
-    finite = np.isfinite(places).all(axis=1)
+    if stood is not None and (stood.shape != (3,) or not (np.abs(stood) < MAX_COORDINATE).all()):
+        raise UsageError(f"{source}: needs a camera of three numbers, metres")
+    # Not a number compares as false; and what is far beyond any room is as good as infinite.
+    finite = (np.abs(places) < MAX_COORDINATE).all(axis=1)
     if facing is not None:
-        finite &= np.isfinite(facing).all(axis=1)
+        finite &= (np.abs(facing) < MAX_COORDINATE).all(axis=1)
     count = int(finite.sum())
     if not MIN_POINTS <= count <= MAX_POINTS:
         raise UsageError(f"{source}: needs {MIN_POINTS} to {MAX_POINTS} finite points; given {count}")

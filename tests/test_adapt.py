@@ -158,7 +158,7 @@ def test_every_format_gives_the_same_points(tmp_path: Path) -> None:
 
 
 def test_what_a_depth_camera_missed_is_left_out() -> None:
-    points = np.concatenate([front(100), np.full((40, 3), np.nan), [[np.inf, 0, 0]]])
+    points = np.concatenate([front(100), np.full((40, 3), np.nan), [[1e300, 0, 0]]])
     scan = checked_scan(points, normals=np.ones_like(points), movable=np.arange(141) % 2)
     assert len(scan.points) == 100
     assert scan.normals is not None
@@ -293,6 +293,7 @@ def history_text(*interactions: object, **changes: object) -> str:
         (history_text(schema_version=2), "schema_version"),
         (history_text(frame={"origin": [0, 0, 0], "up": [0, 0, 0]}), "needs a direction"),
         (history_text(frame={"origin": [float("nan"), 0, 0]}), "origin"),
+        (history_text(frame={"origin": [1e300, 0, 0]}), "origin"),
         (history_text(entry(cloud="/etc/passwd")), "without '..'"),
         (history_text(entry(cloud="../scan.npz")), "without '..'"),
         (history_text(entry(outcome={"motion": -1})), "motion"),
