@@ -53,6 +53,8 @@ class TriedInteraction(StrictModel):
 
     cloud: str = Field(min_length=1, max_length=1000)
     """The scan that was taken before it: a path relative to the history, which does not lead out of its folder."""
+    cloud_sha256: str | None = Field(None, pattern=r"^[0-9a-f]{64}$")
+    """Of that file: a scan that was written over since is not what the try was made on. Unchecked where left out."""
     point: Vector
     """Where the fingertips go."""
     approach: Vector
@@ -89,11 +91,18 @@ class History(StrictModel):
         """The tries that came to an end."""
         return tuple(each for each in self.interactions if each.outcome is not None)
 
-    def proposing(self, action: Action, cloud: str) -> "History":
-        """This history with a proposal in its end, in the place of one that nobody tried."""
+    def proposing(self, action: Action, cloud: str, cloud_sha256: str) -> "History":
+        """This history with a proposal in its end, in the place of one that nobody tried.
+
+        Raises:
+            UsageError: it is full.
+        """
+        if len(self.tried) >= MAX_TRIES:
+            raise UsageError(f"the history holds {MAX_TRIES} tries, which is all that it may; begin another")
         frame = self.frame
         proposal = TriedInteraction(
             cloud=cloud,
+            cloud_sha256=cloud_sha256,
             point=_rounded(frame.point_to_scan(action.point).tolist()),
             approach=_rounded(frame.direction_to_scan(action.approach).tolist()),
             forward=_rounded(frame.direction_to_scan(action.forward).tolist()),
@@ -111,11 +120,11 @@ class History(StrictModel):
         last = self.pending.model_copy(update={"outcome": outcome})
         return self.model_copy(update={"interactions": (*self.tried, last)})
 
-    def interactions_with(self, observe: Callable[[str], Observation]) -> list[Interaction]:
+    def interactions_with(self, observe: Callable[[TriedInteraction], Observation]) -> list[Interaction]:
         """The tries as a policy is told them.
 
         Args:
-            observe: gives the observation of a cloud that the history names.
+            observe: gives the observation that a try was made on.
 
         Raises:
             UsageError: a cloud cannot be read, or a try does not lie on its cloud.
@@ -123,7 +132,7 @@ class History(StrictModel):
         found = []
         for each in self.tried:
             assert each.outcome is not None, "a try has an outcome"
-            observation = observe(each.cloud)
+            observation = observe(each)
             action = action_at(observation, self.frame, each.point, each.approach, each.forward)
             found.append(Interaction(observation, action, each.outcome.outcome))
         return found

@@ -139,12 +139,22 @@ def read_scan(path: Path) -> Scan:
 
     Raises:
         UsageError: it is no such file, or holds no cloud of finite points in metres.
+        StoreError: it is no regular file, or too large.
     """
+    return parse_scan(read_scan_file(path), path)
+
+
+def read_scan_file(path: Path) -> bytes:
+    """The bytes of a cloud's file; raises as `read_scan` does."""
     if path.suffix.lower() not in FORMATS:
         raise UsageError(f"{path}: not a kind of cloud that is read; allowed: {', '.join(FORMATS)}")
     if not path.exists():
         raise UsageError(f"{path}: there is no such file; name a cloud ({', '.join(FORMATS)})")
-    data = read_bounded(path.resolve(), MAX_SCAN_BYTES)
+    return read_bounded(path.resolve(), MAX_SCAN_BYTES)
+
+
+def parse_scan(data: bytes, path: Path) -> Scan:
+    """A cloud from the bytes of its file; raises as `read_scan` does."""
     readers = {".ply": _from_ply, ".npz": _from_npz, ".pcd": read_pcd}
     try:
         columns = readers[path.suffix.lower()](data)

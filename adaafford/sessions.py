@@ -4,6 +4,7 @@ Each step takes a scan and, if something was tried since the last one, its outco
 history and the adapted affordance in a heatmap. A session that is ended and begun again goes on from the history alone.
 """
 
+import hashlib
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from pydantic import Field, ValidationError
 
 from adaafford.heatmaps import heatmap_writer, write_heatmap
 from adaafford.histories import History, TriedOutcome, read_history, write_history
-from adaafford.scans import POINTS, ScanFrame, Vector, observation_of, read_scan
+from adaafford.scans import POINTS, ScanFrame, Vector, observation_of, parse_scan, read_scan, read_scan_file
 from shared import seeds
 from shared.adaptation import Adapter
 from shared.configuration import StrictModel
@@ -124,8 +125,8 @@ class Session:
         history = self._history(cloud)
         if outcome is not None:
             history = history.concluding(outcome)
-        known = history.interactions_with(lambda each: self._observe(each, history.frame))
-        observation = self._observe(name, history.frame)
+        known = history.interactions_with(lambda each: self._observe(each.cloud, each.cloud_sha256, history.frame)[0])
+        observation, sha256 = self._observe(name, None, history.frame)
         rng = seeds.generator(self._seed, PURPOSE, len(known))
         action = AipProposer(self._adapter, rng, self._budget).propose(observation, known)
         do: Literal["try", "act"] = "act" if action is None else "try"
@@ -136,7 +137,7 @@ class Session:
             heat = self._adapter.affordance(observation, known)
             places = history.frame.point_to_scan(observation.points.astype(np.float64))
             write_heatmap(self._files.heatmap, places, heat, observation.pixels)
-        history = history.proposing(action, name)
+        history = history.proposing(action, name, sha256)
         write_history(self._files.history, history)
         proposed = history.interactions[-1]
         return Step(
@@ -175,9 +176,16 @@ class Session:
                 f"{cloud}: does not lie beside the history or below; put it into {folder}, so that both stay together"
             ) from None
 
-    def _observe(self, name: str, frame: ScanFrame) -> Observation:
-        """The observation of a cloud, made once, since the networks' work on it is remembered with it."""
-        if name not in self._observations:
-            scan = read_scan(self._files.history.parent / name)
-            self._observations[name] = observation_of(scan, frame, self._seed, self._points)
-        return self._observations[name]
+    def _observe(self, name: str, wanted: str | None, frame: ScanFrame) -> tuple[Observation, str]:
+        """The observation of a cloud's file, and the file's hash.
+
+        It is made once for the same content, since the networks' work on it is remembered with it.
+        """
+        path = self._files.history.parent / name
+        data = read_scan_file(path)
+        sha256 = hashlib.sha256(data).hexdigest()
+        if wanted not in (None, sha256):
+            raise UsageError(f"{path}: is not the scan that was tried on any more; give every scan a name of its own")
+        if sha256 not in self._observations:
+            self._observations[sha256] = observation_of(parse_scan(data, path), frame, self._seed, self._points)
+        return self._observations[sha256], sha256

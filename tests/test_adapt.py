@@ -410,6 +410,29 @@ def test_a_session_fills_its_history_and_then_acts(policy_folder: Path, scan: Pa
     assert len(read_history(scan.parent / "history.json").interactions) == 2
 
 
+def test_a_scan_that_was_written_over_is_noticed(policy_folder: Path, scan: Path) -> None:
+    """A robot that saves every scan under one name would tell the policy of tries on what it never saw."""
+    live = session(policy_folder, scan)
+    live.step(scan)
+    np.savez(scan, points=front(seed=2))
+    renewed = live.step(scan)
+    assert renewed.tries == 0
+    live.step(scan, TriedOutcome(motion=0.2))
+    np.savez(scan, points=front(seed=3))
+    with pytest.raises(UsageError, match="give every scan a name of its own"):
+        live.step(scan, TriedOutcome(motion=0.2))
+    later = scan.with_name("scan-2.npz")
+    scan.rename(later)
+    np.savez(scan, points=front(seed=2))
+    assert live.step(later, TriedOutcome(motion=0.2)).tries == 2
+
+
+def test_a_history_ends_somewhere(policy_folder: Path, scan: Path) -> None:
+    (scan.parent / "history.json").write_text(history_text(*[entry()] * MAX_TRIES))
+    with pytest.raises(UsageError, match="begin another"):
+        session(policy_folder, scan).step(scan)
+
+
 def without_time(step: Step) -> Step:
     return step.model_copy(update={"seconds": 0.0})
 
