@@ -58,9 +58,9 @@ class Body:
     """Each stands for its convex hull in physics."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class ArticulatedObject:
-    """A whole object, root link at the world's origin."""
+    """A whole object, root link at the world's origin; equal to itself alone."""
 
     ref: ObjectRef
     bodies: tuple[Body, ...]

@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from typing import Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from numpy.typing import NDArray
 
-from collector.articulation import ArticulatedObject
+from collector.articulation import ArticulatedObject, Body
 from shared.configuration import CameraConfig
 from shared.observation import furthest_first, round_normals, round_points
 from shared.vocabulary import Float, Observation
@@ -50,6 +51,9 @@ class Camera(Protocol):
 class EmbreeCamera:
     """Casts one ray a pixel on the CPU; needs no graphics driver.
 
+    Each body has a scene of its own, in its own frame, which is built once for all states and cameras: the rays are
+    moved instead of the body, and the nearest hit of all bodies counts.
+
     Args:
         target: the object.
         world_from_camera: [4, 4].
@@ -61,51 +65,45 @@ class EmbreeCamera:
         self._object = target
         self._size = config.image_size
         self._focal = config.image_size / 2 / np.tan(np.deg2rad(config.field_of_view_deg) / 2)
+        if target not in _SCENES:
+            _SCENES[target] = tuple(_BodyScene(body) for body in target.bodies)
+        self._bodies = _SCENES[target]
 
     def capture(self, joint_positions: Float) -> DepthImage:
         """The image with the parts at `joint_positions`, [parts]."""
-        scene, vertices = self._build(self._object.body_poses(joint_positions))
-        pixels = self._pixels_around(vertices)
-        directions = self._directions(pixels)
-        origins = np.broadcast_to(self.world_from_camera[:3, 3], directions.shape)
-        hits = scene.run(
-            np.ascontiguousarray(origins, dtype=np.float32), directions.astype(np.float32), output=True, dists=None
-        )
-        depths = hits["tfar"].astype(np.float64)
-        seen = (hits["geomID"] >= 0) & (depths > NEAR) & (depths < FAR)
-        normals = hits["Ng"][seen].astype(np.float64)
+        depths = np.full(self._size**2, FAR)
+        normals = np.zeros((self._size**2, 3))
+        bodies = np.zeros(self._size**2, dtype=np.uint8)
+        for number, (body, world_from_body) in enumerate(
+            zip(self._bodies, self._object.body_poses(joint_positions), strict=True)
+        ):
+            body_from_camera = np.linalg.inv(world_from_body) @ self.world_from_camera
+            pixels = self._pixels_around(body.vertices, body_from_camera)
+            if len(pixels) == 0:
+                continue
+            depth, normal = body.cast(body_from_camera[:3, 3], self._directions(pixels) @ body_from_camera[:3, :3].T)
+            nearer = (depth > NEAR) & (depth < depths[pixels])
+            pixels = pixels[nearer]
+            depths[pixels], bodies[pixels] = depth[nearer], number
+            normals[pixels] = normal[nearer] @ world_from_body[:3, :3].T
+        seen = np.flatnonzero(depths < FAR).astype(np.uint32)
+        depths, normals = depths[seen], normals[seen]
+        directions = self._directions(seen) @ self.world_from_camera[:3, :3].T
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-        directions, depths = directions[seen], depths[seen]
         normals *= -np.sign((normals * directions).sum(axis=1, keepdims=True))
         return DepthImage(
-            pixels=pixels[seen],
+            pixels=seen,
             depths=depths,
             points=self.world_from_camera[:3, 3] + directions * depths[:, None],
             normals=normals,
-            bodies=hits["geomID"][seen].astype(np.uint8),
+            bodies=bodies[seen],
         )
 
-    def _build(self, body_poses: Float) -> tuple[rtcore_scene.EmbreeScene, Float]:
-        """An Embree scene with one geometry a body, and all its vertices [V, 3], world."""
-        scene, everything = rtcore_scene.EmbreeScene(), []
-        for body, world_from_body in zip(self._object.bodies, body_poses, strict=True):
-            vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int32)], 0
-            for mesh in body.visuals:
-                vertices.append(mesh.vertices)
-                faces.append(mesh.faces + count)
-                count += len(mesh.vertices)
-            world = np.concatenate(vertices) @ world_from_body[:3, :3].T + world_from_body[:3, 3]
-            everything.append(world)
-            triangles = np.concatenate(faces)
-            if len(triangles) == 0:  # Embree numbers geometries by order, so a body without triangles keeps its place.
-                world, triangles = np.full((3, 3), 1e6), np.array([[0, 1, 2]], dtype=np.int32)
-            TriangleMesh(scene, world.astype(np.float32), triangles.astype(np.int32))
-        return scene, np.concatenate(everything)
-
-    def _pixels_around(self, vertices: Float) -> NDArray[np.uint32]:
-        """Pixels inside the rectangle that holds the projections of all vertices."""
-        camera_from_world = np.linalg.inv(self.world_from_camera)
-        seen = vertices @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    def _pixels_around(self, vertices: Float, body_from_camera: Float) -> NDArray[np.uint32]:
+        """Pixels inside the rectangle that holds the projections of all `vertices`, [V, 3], body frame."""
+        if len(vertices) == 0:
+            return np.zeros(0, dtype=np.uint32)
+        seen = (vertices - body_from_camera[:3, 3]) @ body_from_camera[:3, :3]
         ahead = np.maximum(seen[:, :1], NEAR)
         places = self._size / 2 - self._focal * seen[:, 1:] / ahead  # Columns grow to the right, rows downwards.
         low = np.clip(np.floor(places.min(axis=0)), 0, self._size).astype(int)
@@ -114,11 +112,56 @@ class EmbreeCamera:
         return (rows[:, None] * self._size + columns[None, :]).ravel().astype(np.uint32)
 
     def _directions(self, pixels: NDArray[np.uint32]) -> Float:
-        """Ray directions [P, 3], world, through pixel centres, of length 1 along the camera's forward axis."""
+        """Ray directions [P, 3], camera frame, through pixel centres, of length 1 along the camera's forward axis."""
         rows, columns = np.divmod(pixels.astype(np.int64), self._size)
         left = (self._size / 2 - columns - 0.5) / self._focal
         up = (self._size / 2 - rows - 0.5) / self._focal
-        return np.stack([np.ones_like(left), left, up], axis=1) @ self.world_from_camera[:3, :3].T
+        return np.stack([np.ones_like(left), left, up], axis=1)
+
+
+class _BodyScene:
+    """What is visible of one body, in its own frame.
+
+    Attributes:
+        vertices: [V, 3], body frame; none where the body has no triangles.
+    """
+
+    def __init__(self, body: Body) -> None:
+        vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int32)], 0
+        for mesh in body.visuals:
+            vertices.append(mesh.vertices)
+            faces.append(mesh.faces + count)
+            count += len(mesh.vertices)
+        triangles = np.concatenate(faces)
+        self.vertices = np.concatenate(vertices) if len(triangles) else np.zeros((0, 3))
+        self._scene = rtcore_scene.EmbreeScene()
+        if len(triangles):
+            TriangleMesh(self._scene, self.vertices.astype(np.float32), triangles.astype(np.int32))
+
+    def cast(self, origin: Float, directions: Float) -> tuple[Float, Float]:
+        """Cast rays from one place.
+
+        Args:
+            origin: [3], body frame.
+            directions: [P, 3], body frame.
+
+        Returns:
+            Depths [P], in lengths of the directions, infinite where nothing is hit; and normals [P, 3], body frame, of
+            any length and to either side.
+        """
+        origins = np.broadcast_to(origin, directions.shape)
+        hits = self._scene.run(
+            np.ascontiguousarray(origins, dtype=np.float32),
+            np.ascontiguousarray(directions, dtype=np.float32),
+            output=True,
+            dists=None,
+        )
+        depths = np.where(hits["geomID"] >= 0, hits["tfar"].astype(np.float64), np.inf)
+        return depths, hits["Ng"].astype(np.float64)
+
+
+_SCENES: WeakKeyDictionary[ArticulatedObject, tuple[_BodyScene, ...]] = WeakKeyDictionary()
+"""Of the objects that somebody still holds."""
 
 
 def observation_from(
