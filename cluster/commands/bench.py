@@ -66,8 +66,8 @@ class DynamicsSettings(BenchSettings):
 class CollectSettings(BenchSettings):
     """Of `adaafford bench collect`."""
 
-    rollouts: int = Field(30, ge=1, le=1_000_000)
-    """Of each repeat."""
+    rollouts: int = Field(120, ge=1, le=1_000_000)
+    """Of each repeat: enough that most objects come again, as they do hundreds of times in earnest."""
     repeats: int = Field(3, ge=1, le=1000)
     """The median of these counts."""
     sample: int = Field(9, ge=1, le=10_000)
