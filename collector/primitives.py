@@ -30,9 +30,9 @@ CLEARANCE = 3e-4
 """Free flight ends this far before the object."""
 LEAST_SKIP = 4
 """Steps of free flight; to skip fewer would cost more than to simulate them."""
-REST_STEPS, REST_MOTION = 8, 3e-6
+REST_STEPS, REST_MOTION = 8, 1.2e-5
 """A hold may end when hand and object moved by less than the second a step over the first; at the time constant of the
-hand's drives (0.4 s) less than 0.3 mm is then left to come."""
+hand's drives (24 steps of the fast approach, 48 of its drag) less than 0.6 mm is then left to come."""
 SANE_POSITION = 1e3
 """A joint position beyond this means that the simulation diverged."""
 
