@@ -34,7 +34,7 @@ class Rates:
         measured: when, and on what.
         push_s: a push at the fast fidelity; likewise of the other primitives that push.
         pull_s: a pull.
-        reference_push_s: a push at the published timing, where it is stepped as published.
+        reference_push_s: a push at the reference fidelity, whose timing is the published one.
         reference_pull_s: a pull likewise.
         object_s: reading an object, and letting a state come to rest.
         look_s: a depth image and its cloud.
@@ -66,14 +66,14 @@ class Rates:
 
 
 RATES = Rates(
-    measured="2026-11-22, one core of an AMD EPYC: `adaafford bench collect`, PointNet++ and critics by themselves",
-    push_s=0.016,
-    pull_s=0.050,
-    reference_push_s=0.34,
-    reference_pull_s=0.92,
-    object_s=0.11,
-    look_s=0.020,
-    write_s=0.021,
+    measured="2026-11-22 on one core of an AMD EPYC (`adaafford bench collect` and `fidelity`; networks by themselves)",
+    push_s=0.0054,
+    pull_s=0.020,
+    reference_push_s=0.19,
+    reference_pull_s=0.40,
+    object_s=0.090,
+    look_s=0.017,
+    write_s=0.022,
     multiply_add_s=9.1e-11,
     cloud_s=0.0085,
     scored_row_s=5e-6,
