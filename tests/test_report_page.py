@@ -241,14 +241,19 @@ def test_results_that_are_none_are_one_line(run: RunFolder, capsys: pytest.Captu
         path.write_text(kept)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
-def test_a_browser_draws_every_figure_and_obeys_no_text(run: RunFolder, html: str, tmp_path: Path) -> None:
+def browsed(page: Path, profile: Path) -> subprocess.CompletedProcess[str]:
+    """What a browser makes of a page: the document as it stands in the end, and what it says on its console."""
     assert BROWSER is not None
     flags = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     flags += ["--window-size=1300,6000", "--virtual-time-budget=20000", "--enable-logging=stderr"]
-    command = [BROWSER, *flags, f"--user-data-dir={tmp_path}", "--dump-dom", run.page.as_uri()]
-    seen = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
+    command = [BROWSER, *flags, f"--user-data-dir={profile}", "--dump-dom", page.as_uri()]
+    return subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
+def test_a_browser_draws_every_figure_and_obeys_no_text(run: RunFolder, html: str, tmp_path: Path) -> None:
+    seen = browsed(run.page, tmp_path)
     drawn = Elements(seen.stdout)
     classes = [(attributes.get("class") or "").split() for tag, attributes in drawn.found if tag == "div"]
     plots = [names for names in classes if "plot" in names]
@@ -256,6 +261,40 @@ def test_a_browser_draws_every_figure_and_obeys_no_text(run: RunFolder, html: st
     assert all("js-plotly-plot" in names and "failed" not in names for names in plots)
     assert "<title>AdaAfford: push</title>" in seen.stdout
     assert "Content Security Policy" not in seen.stderr, "nothing even tried"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
+def test_in_a_browser_tabs_change_the_figure_and_its_clouds_turn_together(tmp_path: Path) -> None:
+    panel = Panel("a", observation_of(), np.zeros(200, np.float32))
+    drawings = [Drawing(draw_panels([panel] * 3, 3, ("a",)), tab=name, solid=True) for name in ("one", "two")]
+    page = render(Page("a", "b", (), (Section("s", "t", drawings=tuple(drawings)),)))
+    # The visitor is a script, which the page's policy would not let in.
+    page = re.sub(r"<meta http-equiv[^>]*>", "", page).replace("</body>", f"<script>{VISITOR}</script></body>")
+    (tmp_path / "page.html").write_text(page, encoding="utf-8")
+    title = re.search(r"<title>(.*?)</title>", browsed(tmp_path / "page.html", tmp_path / "profile").stdout)
+    assert title is not None
+    assert json.loads(title[1]) == [True, False, False, True, [9, 9, 9]]
+
+
+VISITOR = """
+const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+const drawn = () => [...document.querySelectorAll(".plot")].map((node) => node.classList.contains("js-plotly-plot"));
+(async () => {
+  await wait(3000);
+  const before = drawn();
+  document.querySelectorAll(".tabs button")[1].click();
+  await wait(3000);
+  const after = drawn();
+  const node = document.querySelectorAll(".plot")[1];
+  const camera = { eye: { x: 9, y: 0, z: 0 }, up: { x: 0, y: 0, z: 1 }, center: { x: 0, y: 0, z: 0 } };
+  node.emit("plotly_relayout", { "scene2.camera": camera });
+  await wait(2000);
+  const eyes = ["scene", "scene2", "scene3"].map((name) => node.layout[name].camera.eye.x);
+  document.title = JSON.stringify([...before, ...after, eyes]);
+})();
+"""
+"""Looks, clicks on the second tab, looks again, and turns its second cloud."""
 
 
 # Pages

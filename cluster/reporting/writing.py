@@ -11,8 +11,6 @@ from cluster.evaluation_tables import RESULTS_FILE
 from cluster.ledger import Ledger
 from cluster.reporting.collecting import collection_section
 from cluster.reporting.failures import failures_section
-from cluster.reporting.hidden_facts import hidden_facts_section
-from cluster.reporting.laboratory import Laboratory, first_readable, hinge_twins
 from cluster.reporting.page import Page, Picture, Section, render, shortened
 from cluster.reporting.proposals import proposals_section
 from cluster.reporting.results import Results, further_section, read_results, results_section, tiles
@@ -85,6 +83,10 @@ def _novel(evaluation: Store, used: ObjectsUsed) -> bool:
 
 
 def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Callable[[str], None]) -> Section:
+    # Only here, since they need the simulator.
+    from cluster.reporting.hidden_facts import hidden_facts_section
+    from cluster.reporting.laboratory import Laboratory, first_readable, hinge_twins
+
     used, setting = run.objects_used(), evaluation.setting
     target = first_readable(Path(used.folder), used.test, setting)
     with TemporaryDirectory(prefix="adaafford-report-") as folder:
