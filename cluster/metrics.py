@@ -42,21 +42,24 @@ class FleetMetrics:
     def add(self, plan: Plan, receipt: "Receipt") -> None:
         """Count a shard."""
         tags = {"task": plan.setting.task, "proposer": plan.proposer}
-        # A counter refuses to be increased by nothing.
-        for counter, count in (
+        for counter, amount in (
             (self._rollouts, receipt.rollouts),
             (self._quarantined, receipt.quarantined),
             (self._successes, receipt.successes),
         ):
-            if count > 0:
-                counter.inc(count, tags)
+            _increase(counter, amount, tags)
         for outcome, count in receipt.outcomes.items():
-            self._interactions.inc(count, {**tags, "outcome": outcome})
+            _increase(self._interactions, count, {**tags, "outcome": outcome})
         for stage, seconds in receipt.seconds.items():
-            if seconds > 0:
-                self._seconds.inc(seconds, {**tags, "stage": stage})
+            _increase(self._seconds, seconds, {**tags, "stage": stage})
         self._policy.set(plan.policy_version, tags)
 
     def replaced(self, cause: Cause) -> None:
         """Count a worker that was replaced."""
         self._restarts.inc(1, {"cause": cause})
+
+
+def _increase(counter: Counter, amount: float, tags: dict[str, str]) -> None:
+    # Ray refuses to increase a counter by nothing.
+    if amount > 0:
+        counter.inc(amount, tags)

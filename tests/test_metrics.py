@@ -61,7 +61,7 @@ def test_receipts_add_up(values: Tally[tuple[str, ...]]) -> None:
     fleet = FleetMetrics(workers=7)
     for _ in range(3):
         fleet.add(PLAN, receipt())
-    fleet.add(PLAN, receipt(successes=0, quarantined=1, outcomes={}))
+    fleet.add(PLAN, receipt(successes=0, quarantined=1, outcomes={"ok": 0}))
     fleet.replaced("loss")
     assert values == {
         ("adaafford_workers",): 7,
