@@ -161,5 +161,5 @@ def test_prometheus_looks_where_metrics_are(compose: dict[str, Any]) -> None:
     exporting = {
         name for name in OURS if "--metrics-export-port=8080" in words_of(compose["services"][name]["command"])
     }
-    assert set(found["names"]) == exporting == {"head", "collector"}
+    assert set(found["names"]) == exporting == {"head", "collector", "driver"}
     assert found["port"] == 8080
