@@ -270,8 +270,8 @@ def test_in_a_browser_tabs_change_the_figure_and_its_clouds_turn_together(tmp_pa
     drawings = [Drawing(draw_panels([panel] * 3, 3, ("a",)), tab=name, solid=True) for name in ("one", "two")]
     page = render(Page("a", "b", (), (Section("s", "t", drawings=tuple(drawings)),)))
     # The visitor is a script, which the page's policy would not let in.
-    page = re.sub(r"<meta http-equiv[^>]*>", "", page).replace("</body>", f"<script>{VISITOR}</script></body>")
-    (tmp_path / "page.html").write_text(page, encoding="utf-8")
+    page = re.sub(r"<meta http-equiv[^>]*>", "", page)
+    (tmp_path / "page.html").write_text(f"{page}<script>{VISITOR}</script>", encoding="utf-8")
     title = re.search(r"<title>(.*?)</title>", browsed(tmp_path / "page.html", tmp_path / "profile").stdout)
     assert title is not None
     assert json.loads(title[1]) == [True, False, False, True, [9, 9, 9]]
@@ -279,20 +279,21 @@ def test_in_a_browser_tabs_change_the_figure_and_its_clouds_turn_together(tmp_pa
 
 VISITOR = """
 const wait = (ms) => new Promise((done) => setTimeout(done, ms));
-const drawn = () => [...document.querySelectorAll(".plot")].map((node) => node.classList.contains("js-plotly-plot"));
+const drawn = () => [...document.querySelectorAll(".plot")].map((node) => !!node.dataset.drawn && !!node._fullLayout);
+const until = async (met) => { for (let k = 0; k < 90 && !met(); k++) await wait(100); };
 (async () => {
-  await wait(3000);
+  await until(() => drawn()[0]);
   const before = drawn();
   document.querySelectorAll(".tabs button")[1].click();
-  await wait(3000);
-  const after = drawn();
   const node = document.querySelectorAll(".plot")[1];
+  await until(() => drawn()[1] && !drawn()[0] && node._ev && node._ev.listenerCount("plotly_relayout"));
+  const after = drawn();
   const camera = { eye: { x: 9, y: 0, z: 0 }, up: { x: 0, y: 0, z: 1 }, center: { x: 0, y: 0, z: 0 } };
   node.emit("plotly_relayout", { "scene2.camera": camera });
-  await wait(2000);
-  const eyes = ["scene", "scene2", "scene3"].map((name) => node.layout[name].camera.eye.x);
-  document.title = JSON.stringify([...before, ...after, eyes]);
-})();
+  const eyes = () => ["scene", "scene2", "scene3"].map((name) => node.layout[name].camera.eye.x);
+  await until(() => eyes().every((x) => x === 9));
+  document.title = JSON.stringify([...before, ...after, eyes()]);
+})().catch((error) => { document.title = JSON.stringify(String(error)); });
 """
 """Looks, clicks on the second tab, looks again, and turns its second cloud."""
 
