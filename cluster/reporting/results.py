@@ -1,6 +1,6 @@
 """What each method knows and does after each budget of tries: the table, the adaptation curves, the first figures."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -274,10 +274,10 @@ def _paper_curve(points: Sequence[tuple[int, float]]) -> go.Scatter:
     return curve.update(marker={"symbol": "circle-open", "size": 8})
 
 
-def _line(name: str, x: Sequence[int], y: Sequence[float], line: dict[str, str | float]) -> go.Scatter:
+def _line(name: str, x: Sequence[int], y: Sequence[float], line: Mapping[str, object]) -> go.Scatter:
     label = plain(name)
     return go.Scatter(
-        x=x, y=y, name=label, legendgroup=label, mode="lines+markers", line=line, hovertemplate="%{y:.1f}"
+        x=x, y=y, name=label, legendgroup=label, mode="lines+markers", line=dict(line), hovertemplate="%{y:.1f}"
     )
 
 

@@ -59,7 +59,7 @@ def read_entries(path: Path) -> list[Entry]:
     Raises:
         StoreError: the file is too large to be ours.
     """
-    entries = []
+    entries: list[Entry] = []
     for line in read_bounded(path, MAX_METRICS_BYTES).splitlines():
         try:
             entry = json.loads(line)
