@@ -69,7 +69,7 @@ class Guard:
 
     @contextmanager
     def job(self, job: Job) -> Iterator[UnderWay]:
-        """Gives what to call before each rollout of a job; the last breadcrumb stays, since it is overwritten anyway."""
+        """Gives what to call before each rollout of a job; the last breadcrumb stays, as it is overwritten anyway."""
 
         def under_way(rollout: int | None) -> None:
             self._underway.leave(Crumb(shard_id=job.shard_id, rollout=rollout))
