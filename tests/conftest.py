@@ -19,8 +19,15 @@ if BESIDE.is_dir():
     os.environ.setdefault(OBJECTS_VARIABLE, str(BESIDE))
 
 
+SLOW_LIMIT_S = 900
+"""For slow tests that name no limit of their own; on a busy machine the usual one cuts them off."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what needs real objects where there are none, and say why."""
+    """Give slow tests time; skip what needs real objects where there are none, and say why."""
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_LIMIT_S))
     if os.environ.get(OBJECTS_VARIABLE):
         return
     reason = f"{OBJECTS_VARIABLE} names no folder of PartNet-Mobility objects, and {BESIDE} is not there"
