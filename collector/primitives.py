@@ -203,9 +203,9 @@ class Trial:
             self._step()
             if not self.fidelity.end_holds_at_rest or step % REST_STEPS:
                 continue
-            now = self.scene.coordinates()
             if closing and self.scene.gripper.opening() <= GRASP_OPENING:
                 return
+            now = self.scene.coordinates()
             if step and np.abs(now - before).max() < REST_STEPS * REST_MOTION:
                 return
             if last and self._object_rests() and self.scene.contact().clearance > CLEARANCE:

@@ -3,17 +3,19 @@
 Shapes: B rollouts, n rows of each, K the longest context.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from learner.augmentation import draw_turns
 from learner.configuration import AapConfig
 from learner.data import Dataset, Split
 from learner.losses import action_scoring_loss, distillation_loss
-from learner.metrics import discrimination
+from learner.metrics import discrimination, discrimination_in_chunks
 from learner.oracle import OracleCritic
 from learner.sampling import Batch, draw_numbers, order_rows, spread
 from learner.sharing import share
@@ -171,13 +173,14 @@ class OracleStage:
         """The oracle critic's figures on objects not trained on: a bound for what adaptation can reach."""
         rng = np.random.default_rng(_VALIDATION_SEED)
         rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
-        scores, labels = [], []
-        for start in range(0, len(rollouts), _CHUNK):
-            ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
+
+        def judge(chunk: Sequence[int]) -> tuple[ArrayLike, ArrayLike]:
+            ordered = order_rows(self.dataset, chunk, self.config.rows_per_rollout, rng)
             batch = Batch.of(self.dataset, ordered)
-            scores.append(torch.sigmoid(self.critic.logits(batch))[ordered.valid])
-            labels.append(batch.success[ordered.valid])
-        found = discrimination(torch.cat(scores).numpy(force=True), torch.cat(labels).numpy(force=True))
+            scores = torch.sigmoid(self.critic.logits(batch))[ordered.valid]
+            return scores.numpy(force=True), batch.success[ordered.valid].numpy(force=True)
+
+        found = discrimination_in_chunks(rollouts, _CHUNK, judge)
         figures = {name: getattr(found, name) for name in CURVE_FIGURES}
         return {"score": found.bce, "base_rate": found.base_rate} | figures
 

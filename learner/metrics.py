@@ -1,5 +1,6 @@
 """How well scores tell successes from failures. NaN where a figure is not defined (no row, or one class only)."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,21 @@ def discrimination(scores: ArrayLike, successes: ArrayLike) -> Discrimination:
         base_rate=float(labels.mean()) if len(labels) else float("nan"),
         rows=len(labels),
     )
+
+
+def discrimination_in_chunks(
+    rollouts: Sequence[int], size: int, judge: Callable[[Sequence[int]], tuple[ArrayLike, ArrayLike]]
+) -> Discrimination:
+    """All figures of the rows of many rollouts, `size` of which are judged at once to bound memory.
+
+    Args:
+        rollouts: at least one.
+        size: of a chunk.
+        judge: gives scores and successes, [I] each, of all rows of a chunk.
+    """
+    judged = [judge(rollouts[start : start + size]) for start in range(0, len(rollouts), size)]
+    scores, successes = zip(*judged, strict=True)
+    return discrimination(np.concatenate(scores), np.concatenate(successes))
 
 
 def f_score(predicted: NDArray[np.bool_], labels: NDArray[np.bool_]) -> float:

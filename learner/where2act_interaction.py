@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from learner.augmentation import draw_turns
@@ -15,7 +15,7 @@ from learner.configuration import InteractionConfig
 from learner.data import Dataset, Split
 from learner.frozen import FrozenPrior
 from learner.losses import action_scoring_loss
-from learner.metrics import discrimination
+from learner.metrics import discrimination_in_chunks
 from learner.sampling import Batch, OrderedRows, draw_numbers, padded, spread
 from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
@@ -81,13 +81,13 @@ class InteractionStage:
         """Figures on objects not trained on; "score" is the cross entropy."""
         rng = np.random.default_rng(_VALIDATION_SEED)
         rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
-        scores, labels = [], []
-        for start in range(0, len(rollouts), _CHUNK):
-            ordered = self.order(rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
+
+        def judge(chunk: Sequence[int]) -> tuple[ArrayLike, ArrayLike]:
+            ordered = self.order(chunk, self.config.rows_per_rollout, rng)
             logits, success, asked = self._predict(ordered)
-            scores.append(torch.sigmoid(logits)[asked])
-            labels.append(success[asked])
-        found = discrimination(torch.cat(scores).numpy(force=True), torch.cat(labels).numpy(force=True))
+            return torch.sigmoid(logits)[asked].numpy(force=True), success[asked].numpy(force=True)
+
+        found = discrimination_in_chunks(rollouts, _CHUNK, judge)
         return {"score": found.bce, "f_score": found.f_score, "auc": found.auc, "base_rate": found.base_rate}
 
     def order(self, rollouts: Sequence[int], size: int, rng: np.random.Generator) -> OrderedRows:

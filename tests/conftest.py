@@ -60,3 +60,12 @@ def s3_url(s3_endpoint: str, monkeypatch: pytest.MonkeyPatch) -> str:
         monkeypatch.setenv(f"AWS_{name}", value)
     monkeypatch.setenv("AWS_ENDPOINT_URL", s3_endpoint)
     return f"s3://adaafford/{uuid.uuid4().hex}"
+
+
+@pytest.fixture(params=["disk", "bucket"])
+def where(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A place for a store, of each kind."""
+    if request.param == "disk":
+        return str(tmp_path / "store")
+    url: str = request.getfixturevalue("s3_url")
+    return url

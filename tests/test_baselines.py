@@ -30,7 +30,7 @@ from shared.networks.where2act_interaction import TRIES
 from shared.policy import Policy
 from shared.records import InteractionRecord, RolloutRecord
 from shared.vocabulary import Interaction, Role
-from tests.test_learner_data import fabricated_plan, fabricated_rollouts, make_store
+from tests.test_learner_data import coins, fabricated_plan, fabricated_rollouts, make_store
 from tests.test_learner_training import EVERYTHING, FAST, QUICK, Killed, KilledError, descend
 from tests.test_methods import BASELINES, CRITICS, policy_with_all
 from tests.test_networks import TINY
@@ -55,11 +55,7 @@ def dataset(folder: Path) -> Dataset:
 
 @pytest.fixture(scope="module")
 def coin_dataset(dataset: Dataset) -> Dataset:
-    """All tries of a rollout succeed, or none does: only a try tells which."""
-    success = torch.zeros(len(dataset.rows))
-    for number, rows in enumerate(dataset.rollouts):
-        success[rows] = float(number % 2)
-    return dataclasses.replace(dataset, rows=dataclasses.replace(dataset.rows, success=success, motion=success * 0.3))
+    return coins(dataset)
 
 
 def stage_of(name: BaselineName, dataset: Dataset, policy: Policy) -> InteractionStage | AdaptationStage:

@@ -45,6 +45,17 @@ def make_store(path: Path, rollouts: list[RolloutRecord] | None = None, plan: Pl
     return store
 
 
+def coins(dataset: Dataset) -> Dataset:
+    """All tries of a rollout succeed, or none does, as its first hidden fact says: otherwise only a try tells which."""
+    success = torch.zeros(len(dataset.rows))
+    for number, rows in enumerate(dataset.rollouts):
+        success[rows] = float(number % 2)
+    facts = torch.zeros_like(dataset.rows.facts)
+    facts[:, 0] = success
+    rows = dataclasses.replace(dataset.rows, success=success, motion=success * 0.3, facts=facts)
+    return dataclasses.replace(dataset, rows=rows)
+
+
 def fabricated_plan() -> Plan:
     return Plan(setting=fabricate_setting(objects=4, points=64))
 

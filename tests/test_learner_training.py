@@ -31,7 +31,7 @@ from shared.errors import UsageError
 from shared.policy import WEIGHTS_FILE, Policy
 from shared.records import InteractionRecord, RolloutRecord
 from shared.vocabulary import Role
-from tests.test_learner_data import fabricated_plan, fabricated_rollouts, make_store
+from tests.test_learner_data import coins, fabricated_plan, fabricated_rollouts, make_store
 from tests.test_networks import TINY
 
 QUICK = AffordanceConfig(steps=4, validate_every=2, proposals=10, points=16)
@@ -55,14 +55,7 @@ def dataset(folder: Path) -> Dataset:
 
 @pytest.fixture(scope="module")
 def coin_dataset(dataset: Dataset) -> Dataset:
-    """All tries of a rollout succeed, or none does: only a try tells which."""
-    success = torch.zeros(len(dataset.rows))
-    for number, rows in enumerate(dataset.rollouts):
-        success[rows] = float(number % 2)
-    rows = dataclasses.replace(dataset.rows, success=success, motion=success * 0.3)
-    facts = torch.zeros_like(rows.facts)
-    facts[:, 0] = success
-    return dataclasses.replace(dataset, rows=dataclasses.replace(rows, facts=facts))
+    return coins(dataset)
 
 
 EVERYTHING = Split(tuple(range(8)), tuple(range(8)))

@@ -50,14 +50,6 @@ def status_of(state: str = "collecting", written: float = 1000.0, process: str =
     )
 
 
-@pytest.fixture(params=["disk", "bucket"])
-def where(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    if request.param == "disk":
-        return str(tmp_path / "store")
-    url: str = request.getfixturevalue("s3_url")
-    return url
-
-
 def fill(where: str) -> Store:
     store = Store.create(where, SETTING)
     for job in (Job(PLAN.key, 0, 2), Job(PLAN.key, 4, 6)):

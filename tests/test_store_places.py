@@ -23,15 +23,6 @@ PLAN = Plan(setting=SETTING)
 JOB = Job(PLAN.key, 0, 2)
 
 
-@pytest.fixture(params=["disk", "bucket"])
-def where(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """A place for a store, of each kind."""
-    if request.param == "disk":
-        return str(tmp_path / "store")
-    url: str = request.getfixturevalue("s3_url")
-    return url
-
-
 @pytest.fixture
 def place(where: str) -> Place:
     if "://" not in where:
