@@ -66,15 +66,25 @@ class Blame:
 
     def quarantined(self, job: Job) -> dict[int, str]:
         """Rollouts of the job that are not to be executed any more, and why."""
-        return {
-            rollout: why
-            for (plan_key, rollout), why in self._quarantined.items()
-            if plan_key == job.plan_key and job.start <= rollout < job.stop
-        }
+        if not self._quarantined:
+            return {}
+        keys = ((job.plan_key, rollout) for rollout in range(job.start, job.stop))
+        return {key[1]: self._quarantined[key] for key in keys if key in self._quarantined}
 
     def acquit(self) -> None:
         """Take note that a job was done, so workers can live."""
         self._idle_losses = 0
+
+    def charge_nobody(self, reason: str) -> None:
+        """Count a process that was lost before it was given a job.
+
+        Raises:
+            WorkerError: so many were lost without a job being done meanwhile that none will live.
+        """
+        self._idle_losses += 1
+        logger.warning("a worker was lost before it had a job (%s); trying again", reason, extra={"reason": reason})
+        if self._idle_losses >= self._most_idle_losses:
+            raise WorkerError(f"{self._idle_losses} workers were lost before they had a job; last: {reason}")
 
     def charge(self, job: Job, failure: Failure) -> None:
         """Count a failure of `job`, which is tried again: without the culprit if that failed often enough.

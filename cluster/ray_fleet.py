@@ -1,11 +1,17 @@
-"""The fleet of Ray actors: bounded work in flight, dead and hung actors replaced, only receipts coming back."""
+"""The fleet of Ray actors: bounded work in flight, dead and hung actors replaced, only receipts coming back.
+
+What the driver does for a shard does not depend on how many actors there are: answers call back by themselves, instead
+of being looked for among all that are expected, and seats are filed by what they want (`cluster.seats`).
+"""
 
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from concurrent.futures import Future
+from functools import partial
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any, Protocol
 
 import ray
 from ray.exceptions import RayError, RayTaskError
@@ -14,74 +20,102 @@ from cluster.blame import Blame, Failure, describe
 from cluster.fleet import WAIT_S, WorkerFactory
 from cluster.metrics import Cause, FleetMetrics
 from cluster.orders import Order, Orders
+from cluster.seats import Seat, Seats, Task
 from collector.actor import WorkerActor
 from collector.guard import Limits
 from shared.errors import AdaAffordError
 from shared.files import end_if_here
-from shared.plan import Plan
-from shared.underway import Crumb, Underway
+from shared.plan import Job, Plan
+from shared.underway import Underway
 
 if TYPE_CHECKING:
     from collector.worker import Receipt
 
-IN_FLIGHT = 2
-"""Jobs an actor holds: one under way, one that waits so that the actor never idles for the driver's sake."""
 START_LIMIT_S = 120.0
 """An actor's process imports an engine and PyTorch, which a busy machine or a cold disk may slow; no job's fault."""
 GRACE_S = 5.0
 """What an actor's own watchdog, which leaves a traceback, has in advance of the driver, which cannot."""
 LOST = "its process was lost without a word: killed from outside, or for want of memory"
-KEPT_POLICIES = 3
-"""Versions that the object store holds; older ones were replaced, and only jobs that failed may want them again."""
+KEPT = 3
+"""Plans and policies that the object store holds; older ones were replaced, and only jobs that failed want them."""
 POLL_S = 1.0
 """How often the driver looks for hung actors, however many receipts come."""
+LOOK_S = 0.1
+"""How long it looks each time, at one after the other: a breadcrumb in a bucket takes a request."""
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
-class _Seat:
-    """A place for one actor, and what it was given to do, oldest first."""
+class Actor(Protocol):
+    """What a fleet asks of an actor; each answer comes later."""
 
-    actor: Any = None
-    arrival: Any = None
-    """What becomes ready when the actor's process is up; None from then on."""
-    process: str = ""
-    """By which name its breadcrumbs go; "" until it is up."""
-    pending: deque[tuple[Any, Order]] = field(default_factory=deque)
-    busy_since: float = 0.0
-    """When the actor was started, or the oldest pending job came to the head; `time.monotonic`."""
-    seen: tuple[Crumb | None, float] | None = None
-    """The last breadcrumb that was looked at, and since when it has been the same."""
-    first_mb: float | None = None
-    """What the process held after its first job."""
-    retiring: bool = False
-    """Whether it is only to finish what it has."""
+    def arrive(self) -> "Future[str]":
+        """The name of its process, once that is up."""
+        ...
 
-    def settle(self) -> Order:
-        """Strike out the oldest pending job, and return it; the next one comes to the head."""
-        _, order = self.pending.popleft()
-        self.busy_since, self.seen = time.monotonic(), None
-        return order
+    def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[Receipt]":
+        """See `collector.actor.WorkerActor.run`; executed in the order asked."""
+        ...
 
-    def look(self, underway: Underway) -> tuple[Crumb | None, float]:
-        """The breadcrumb of the rollout under way, and since when it has been seen unchanged."""
-        crumb = underway.crumb_of(self.process)
-        if self.seen is None or self.seen[0] != crumb:
-            self.seen = crumb, time.monotonic()
-        return self.seen
+    def end(self) -> None:
+        """End it at once."""
+        ...
 
-    def vacate(self) -> None:
-        """Forget the actor and all that was about it."""
-        self.actor = self.arrival = self.seen = self.first_mb = None
-        self.process, self.retiring = "", False
-        self.pending.clear()
+
+class ProcessActor:
+    """An `Actor`: a process of its own, with one CPU. No restarts by Ray, which would run only `__init__` again."""
+
+    def __init__(self, make_worker: WorkerFactory, underway: Underway, limits: Limits) -> None:
+        actor: Any = ray.remote(num_cpus=1, max_restarts=0)(WorkerActor)
+        self._actor = actor.remote(make_worker, underway, limits)
+
+    def arrive(self) -> "Future[str]":
+        """See `Actor.arrive`."""
+        answer: Future[str] = self._actor.arrive.remote().future()
+        return answer
+
+    def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[Receipt]":
+        """See `Actor.run`."""
+        answer: Future[Receipt] = self._actor.run.remote([plan], job, policy, quarantined).future()
+        return answer
+
+    def end(self) -> None:
+        """See `Actor.end`."""
+        ray.kill(self._actor)
+
+
+class _Shelf:
+    """What actors pull when they first need it: the newest few, each put into Ray's object store once."""
+
+    def __init__(self) -> None:
+        self._kept: dict[Hashable, tuple[Any, Any]] = {}
+
+    def put(self, key: Hashable, value: Any) -> Any:
+        """The reference to a value."""
+        kept = self._kept.get(key)
+        if kept is None or (kept[0] is not value and kept[0] != value):
+            self._kept.pop(key, None)
+            while len(self._kept) >= KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = kept = value, ray.put(value)
+        return kept[1]
+
+    def get(self, key: Hashable) -> list[Any]:
+        """The reference, or nothing if there is none any more."""
+        return [self._kept[key][1]] if key in self._kept else []
 
 
 class RayFleet:
     """Actors of `collector.actor`, one CPU each, alive over all rounds. Needs a session (`cluster.session`)."""
 
-    def __init__(self, make_worker: WorkerFactory, underway: Underway, workers: int, limits: Limits) -> None:
+    def __init__(
+        self,
+        make_worker: WorkerFactory,
+        underway: Underway,
+        workers: int,
+        limits: Limits,
+        call: Callable[[], Actor] | None = None,
+    ) -> None:
         """Start nothing yet: actors come up with the first jobs.
 
         Args:
@@ -89,46 +123,42 @@ class RayFleet:
             underway: where actors leave their breadcrumbs.
             workers: how many actors.
             limits: what a rollout may take; an actor that goes beyond is ended.
+            call: makes an actor; None: a process with a worker.
         """
         self.workers = workers
         self.restarts = 0
-        self._make_worker = make_worker
+        self._call = call or partial(ProcessActor, make_worker, underway, limits)
         self._underway = underway
         self._limits = limits
         self._poll_s = min(POLL_S, limits.rollout_s / 4)
         self._looked = time.monotonic()
-        self._seats = [_Seat() for _ in range(workers)]
-        self._policies: dict[int, Any] = {}
+        self._seats = Seats(workers)
+        self._in_flight = 0
+        self._answered: SimpleQueue[Task] = SimpleQueue()
+        self._plans, self._policies = _Shelf(), _Shelf()
         self._metrics = FleetMetrics(workers)
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """See `Fleet.load_policy`: one `ray.put`; actors pull it when a plan first needs it."""
-        if version not in self._policies:
-            while len(self._policies) >= KEPT_POLICIES:
-                self._policies.pop(next(iter(self._policies)))
-            self._policies[version] = ray.put(dict(files))
+        self._policies.put(version, dict(files))
 
     def run(self, orders: Orders, on_receipt: Callable[["Receipt"], None]) -> None:
         """See `Fleet.run`."""
         waiting: deque[Order] = deque()
         blame = Blame(self.workers)
         try:
-            while waiting or not orders.ended or any(seat.pending for seat in self._seats):
+            while waiting or not orders.ended or self._in_flight:
                 self._hand_out(orders, waiting, blame)
-                # A seat whose actor is still on its way has nothing else that could be ready.
-                refs = [seat.arrival or seat.pending[0][0] for seat in self._seats if seat.pending]
-                if not refs:
-                    time.sleep(WAIT_S)
-                    continue
-                ready, _ = ray.wait(refs, num_returns=1, timeout=self._poll_s)
-                if ready:
-                    self._take_in(ready[0], waiting, blame, on_receipt)
+                for seat in self._wait():
+                    # Answers of one actor are taken in the order of what was asked, in whichever they are announced.
+                    while seat.tasks and seat.tasks[0].answer.done():
+                        self._take_in(seat, waiting, blame, on_receipt)
                 self._replace_hung(waiting, blame)
         finally:
             # Only after a failure or an interrupt is anything left; what an actor would still commit is wanted by the
             # next run anyway, but nobody would wait for it, so the actor goes.
             for seat in self._seats:
-                if seat.pending:
+                if seat.orders:
                     self._dismiss(seat)
 
     def close(self) -> None:
@@ -136,61 +166,89 @@ class RayFleet:
         for seat in self._seats:
             self._dismiss(seat)
 
+    def _wait(self) -> Iterator[Seat]:
+        """Seats whose actors have answered, as soon as there is one; those that answer meanwhile come the next time."""
+        timeout_s = self._poll_s if self._in_flight or self._seats.called else WAIT_S
+        for _ in range(max(1, self._answered.qsize())):
+            try:
+                task = self._answered.get(timeout=timeout_s)
+            except Empty:
+                return
+            if task in task.seat.tasks:
+                yield task.seat
+
     def _hand_out(self, orders: Orders, waiting: deque[Order], blame: Blame) -> None:
-        """Give each actor up to `IN_FLIGHT` jobs; no actor gets a second one while another has none.
+        """Give actors that are up what they want, and call an actor for each order that has to wait.
+
+        An actor that is called may be long in coming, or for ever where a machine has left; so nothing is bound to it.
 
         Args:
             orders: where new ones come from.
-            waiting: those that failed, which go first.
+            waiting: those that failed, which go first, and those that actors were called for.
             blame: knows what is not to be executed any more.
         """
-        for seat in self._seats:
-            if seat.retiring and not seat.pending:
-                self._dismiss(seat)
-                self._count_replaced("growth")
-        for depth in range(IN_FLIGHT):
-            for seat in self._seats:
-                if len(seat.pending) == depth and not seat.retiring:
-                    order = waiting.popleft() if waiting else orders.take()
-                    if order is None:
-                        return
-                    self._give(seat, order, blame)
+        while (seat := self._seats.hungriest) is not None:
+            order = waiting.popleft() if waiting else orders.take()
+            if order is None:
+                return
+            self._give(seat, order, blame)
+        while (seat := self._seats.empty) is not None:
+            if len(waiting) <= self._seats.called:
+                order = orders.take()
+                if order is None:
+                    return
+                waiting.append(order)
+            seat.actor, seat.busy_since = self._call(), time.monotonic()
+            self._ask(seat, None, seat.actor.arrive())
 
-    def _give(self, seat: _Seat, order: Order, blame: Blame) -> None:
-        """Submit an order to the seat's actor, which is started if there is none."""
-        if seat.actor is None:
-            self._start(seat)
-        if not seat.pending:
+    def _give(self, seat: Seat, order: Order, blame: Blame) -> None:
+        """Submit an order to the seat's actor."""
+        if not seat.tasks:
             seat.busy_since = time.monotonic()
+        plan = self._plans.put(order.plan.key, order.plan)
         # Of a version that is no longer kept, the worker reads the weights in the store.
         policy = self._policies.get(order.plan.policy_version)
-        box = [] if policy is None else [policy]
-        ref = seat.actor.run.remote(order.plan, order.job, box, blame.quarantined(order.job))
-        seat.pending.append((ref, order))
+        self._in_flight += 1
+        self._ask(seat, order, seat.actor.run(plan, order.job, policy, blame.quarantined(order.job)))
 
-    def _take_in(self, ref: Any, waiting: deque[Order], blame: Blame, on_receipt: Callable[["Receipt"], None]) -> None:
-        """Report the receipt behind `ref`, or see to the failure that it stands for."""
-        seat = next(seat for seat in self._seats if seat.pending and ref in (seat.arrival, seat.pending[0][0]))
+    def _ask(self, seat: Seat, order: Order | None, answer: "Future[Any]") -> None:
+        """Take note of what an actor was asked."""
+        task = Task(seat, order, answer)
+        seat.tasks.append(task)
+        self._seats.file(seat)
+        answer.add_done_callback(lambda _: self._answered.put(task))
+
+    def _take_in(
+        self, seat: Seat, waiting: deque[Order], blame: Blame, on_receipt: Callable[["Receipt"], None]
+    ) -> None:
+        """Report the receipt that has come for the seat's oldest task, or see to the failure."""
+        task = seat.tasks[0]
         try:
-            message = ray.get(ref)
+            message = task.answer.result()
         except RayTaskError as error:
             if isinstance(error.cause, AdaAffordError):
                 raise error.cause from None
             self._fail(seat, waiting, blame, describe(error.cause or error), fault=True)
             return
         except RayError:
-            words = self._underway.fault_of(seat.process)
+            words = self._underway.fault_of(seat.process) if seat.process else ""
             self._fail(seat, waiting, blame, words or LOST, fault=bool(words))
             return
-        if seat.arrival is not None:
-            seat.arrival, seat.process, seat.busy_since = None, message, time.monotonic()
+        seat.settle()
+        if task.order is None:
+            seat.process = message
             logger.info("a worker is up", extra={"worker": seat.process})
-            return
-        order = seat.settle()
-        blame.acquit()
-        self._note_done(seat, order.plan, message)
-        self._retire_if_grown(seat, message)
-        on_receipt(message)
+        else:
+            self._in_flight -= 1
+            blame.acquit()
+            self._note_done(seat, task.order.plan, message)
+            self._retire_if_grown(seat, message)
+        if seat.retiring and not seat.tasks:
+            self._dismiss(seat)
+            self._count_replaced("growth")
+        self._seats.file(seat)
+        if task.order is not None:
+            on_receipt(message)
 
     def _replace_hung(self, waiting: deque[Order], blame: Blame) -> None:
         """Replace actors that hang so thoroughly that not even their own watchdog ended them.
@@ -198,25 +256,36 @@ class RayFleet:
         A rollout is over its limit when the driver has seen its breadcrumb unchanged for so long by its own clock:
         clocks of machines differ.
         """
-        if time.monotonic() - self._looked < self._poll_s:
+        now = time.monotonic()
+        if now - self._looked < self._poll_s:
             return
-        self._looked = time.monotonic()
-        for seat in self._seats:
-            if not seat.pending:
-                continue
-            if seat.arrival is not None:
-                if time.monotonic() - seat.busy_since > START_LIMIT_S:
-                    reason = f"the start of its process took more than {START_LIMIT_S:g} s"
-                    self._fail(seat, waiting, blame, reason, fault=False)
-            elif time.monotonic() - seat.busy_since > self._limits.rollout_s:
-                crumb, since = seat.look(self._underway)
-                limit = START_LIMIT_S if crumb is None else self._limits.rollout_s + GRACE_S
-                if time.monotonic() - since > limit:
-                    # A process that is stopped does not hear Ray.
-                    end_if_here(seat.process)
-                    self._fail(seat, waiting, blame, f"took more than {limit:g} s, and had to be killed", fault=True)
+        self._looked = now
+        for seat in self._seats.in_turn():
+            if time.monotonic() - now > LOOK_S:
+                return
+            busy_s = now - seat.busy_since if seat.tasks else 0.0
+            if seat.process:
+                if busy_s > self._limits.rollout_s:
+                    self._look(seat, waiting, blame)
+            elif busy_s > START_LIMIT_S:
+                self._call_again(seat, blame)
 
-    def _note_done(self, seat: _Seat, plan: Plan, receipt: "Receipt") -> None:
+    def _look(self, seat: Seat, waiting: deque[Order], blame: Blame) -> None:
+        """Replace a seat's actor if it hangs."""
+        crumb, since = seat.look(self._underway)
+        limit = START_LIMIT_S if crumb is None else self._limits.rollout_s + GRACE_S
+        if time.monotonic() - since > limit:
+            # A process that is stopped does not hear Ray.
+            end_if_here(seat.process)
+            self._fail(seat, waiting, blame, f"took more than {limit:g} s, and had to be killed", fault=True)
+
+    def _call_again(self, seat: Seat, blame: Blame) -> None:
+        """Give up an actor that has not come; that others work means that a machine is missing, which may come back."""
+        self._dismiss(seat)
+        if not any(other.process for other in self._seats):
+            blame.charge_nobody(f"the start of its process took more than {START_LIMIT_S:g} s")
+
+    def _note_done(self, seat: Seat, plan: Plan, receipt: "Receipt") -> None:
         """Tell log and metrics of a shard."""
         self._metrics.add(plan, receipt)
         about = {"plan": plan.key, "policy": plan.policy_version, "shard": receipt.shard_id, "worker": seat.process}
@@ -224,7 +293,7 @@ class RayFleet:
         about |= {"seconds": receipt.seconds.get("total", 0.0)}
         logger.info("shard %s is committed", receipt.shard_id, extra=about)
 
-    def _retire_if_grown(self, seat: _Seat, receipt: "Receipt") -> None:
+    def _retire_if_grown(self, seat: Seat, receipt: "Receipt") -> None:
         """Hand an actor no further jobs if its memory has grown by half of what it may grow by."""
         if seat.first_mb is None:
             seat.first_mb = receipt.memory_mb
@@ -234,16 +303,19 @@ class RayFleet:
             logger.warning("a worker has grown by %.0f MB and is replaced", grown_mb, extra=about)
             seat.retiring = True
 
-    def _fail(self, seat: _Seat, waiting: deque[Order], blame: Blame, reason: str, *, fault: bool) -> None:
+    def _fail(self, seat: Seat, waiting: deque[Order], blame: Blame, reason: str, *, fault: bool) -> None:
         """Replace the seat's actor and put its jobs back in front; only what was under way is to blame."""
-        orders = [order for _, order in seat.pending]
-        jobs = [order.job for order in orders]
-        crumb = self._underway.crumb_of(seat.process)
+        orders = seat.orders
+        crumb = self._underway.crumb_of(seat.process) if seat.process else None
         about = {"worker": seat.process, "rollout": crumb.rollout if crumb else None, "reason": reason}
         logger.info("a worker is replaced: %s", reason, extra=about)
         self._dismiss(seat)
         self._count_replaced("fault" if fault else "loss")
+        if not orders:
+            blame.charge_nobody(reason)
+            return
         waiting.extendleft(reversed(orders))
+        jobs = [order.job for order in orders]
         job = next((job for job in jobs if crumb is not None and crumb.shard_id == job.shard_id), jobs[0])
         known = crumb is not None and crumb.shard_id == job.shard_id
         blame.charge(job, Failure(reason, crumb.rollout if known and crumb is not None else None, fault))
@@ -252,16 +324,12 @@ class RayFleet:
         self.restarts += 1
         self._metrics.replaced(cause)
 
-    def _start(self, seat: _Seat) -> None:
-        """Seat a new actor. No restarts by Ray: those would run only `__init__` again, and lose what was in flight."""
-        actor = ray.remote(num_cpus=1, max_restarts=0)(WorkerActor)
-        seat.actor = actor.remote(self._make_worker, self._underway, self._limits)
-        seat.arrival = seat.actor.arrive.remote()
-
-    def _dismiss(self, seat: _Seat) -> None:
+    def _dismiss(self, seat: Seat) -> None:
         """End the seat's actor and forget what it was given and what it left."""
         if seat.actor is not None:
-            ray.kill(seat.actor)
+            seat.actor.end()
         if seat.process:
             self._underway.forget(seat.process)
+        self._in_flight -= len(seat.orders)
         seat.vacate()
+        self._seats.file(seat)

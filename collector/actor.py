@@ -43,6 +43,8 @@ class WorkerActor:
         self._make_worker = make_worker
         self._guard = Guard(underway, limits)
         self._worker: WrappedWorker | None = None
+        self._broken = False
+        self._plans: dict[str, Plan] = {}
         self._loaded: set[int] = set()
 
     def arrive(self) -> str:
@@ -52,7 +54,7 @@ class WorkerActor:
 
     def run(
         self,
-        plan: Plan,
+        plan: "list[ray.ObjectRef[Plan]]",
         job: Job,
         policy: "list[ray.ObjectRef[Mapping[str, bytes]]]",
         quarantined: Mapping[int, str],
@@ -60,18 +62,30 @@ class WorkerActor:
         """Execute `job` and return its receipt; arrays never cross.
 
         Args:
-            plan: the plan that the job belongs to.
+            plan: the reference to the plan that the job belongs to, within a list so that Ray hands over the reference
+                and the plan, which names all objects, is pulled once.
             job: the job.
-            policy: the reference to the weights of `plan.policy_version`, within a list so that Ray hands over the
-                reference and the bytes are pulled at most once a version; empty if the plan uses none.
+            policy: likewise to the weights of the plan's policy; empty if it uses none.
             quarantined: rollouts of the job that are not to be executed, and why.
         """
-        worker = self._live_worker()
-        if policy and plan.policy_version not in self._loaded:
-            worker.load_policy(plan.policy_version, ray.get(policy[0]))
-            self._loaded.add(plan.policy_version)
+        # The job after one that failed is here already; it would overwrite the breadcrumb before the driver has seen it.
+        if self._broken:
+            raise RuntimeError("the job before this one failed, and the process is about to be replaced")
+        self._broken = True
+        worker, known = self._live_worker(), self._plan(job.plan_key, plan[0])
+        if policy and known.policy_version not in self._loaded:
+            worker.load_policy(known.policy_version, ray.get(policy[0]))
+            self._loaded.add(known.policy_version)
         with self._guard.job(job) as under_way:
-            return worker.run(plan, job, quarantined, under_way)
+            receipt = worker.run(known, job, quarantined, under_way)
+        self._broken = False
+        return receipt
+
+    def _plan(self, key: str, ref: "ray.ObjectRef[Plan]") -> Plan:
+        """The plan of this name, pulled if it is not here."""
+        if key not in self._plans:
+            self._plans[key] = ray.get(ref)
+        return self._plans[key]
 
     def _live_worker(self) -> WrappedWorker:
         """The worker, made if there is none."""

@@ -144,13 +144,13 @@ def test_orders_are_taken_no_earlier_than_somebody_is_free_for_them(fleet: Fleet
 
 def test_weights_reach_the_live_workers_once_a_version(fleet: Fleet, tmp_path: Path) -> None:
     run(fleet, 4)
-    before = {line.split()[1] for line in (tmp_path / "begun").read_text().splitlines()}
     for version in (1, 2):
         fleet.load_policy(version, {"weights.safetensors": b"weights %d" % version})
         fleet.run(Listed(plan("aip", version), jobs(8, f"aip-v{version}")), lambda receipt: None)
         pulls = (tmp_path / f"pulled-{version}").read_text().split()
         assert len(pulls) == len(set(pulls)) <= fleet.workers
-    assert {line.split()[1] for line in (tmp_path / "begun").read_text().splitlines()} == before
+    assert fleet.restarts == 0
+    assert len({line.split()[1] for line in (tmp_path / "begun").read_text().splitlines()}) <= fleet.workers
 
 
 def test_a_replaced_actor_pulls_the_weights_itself(ray_fleet: Fleet, tmp_path: Path) -> None:
@@ -194,13 +194,10 @@ def test_memory_that_explodes_is_bounded(ray_fleet: Fleet, tmp_path: Path) -> No
 
 def test_an_actor_that_has_grown_is_replaced_at_no_cost(ray_fleet: Fleet, tmp_path: Path) -> None:
     run(ray_fleet, 4)
-    before = {line.split()[1] for line in (tmp_path / "begun").read_text().splitlines()}
     (tmp_path / "grow-2").write_text("1")
     assert run(ray_fleet, 12) == [job.shard_id for job in jobs(12)]
-    lines = (tmp_path / "begun").read_text().splitlines()
-    after = {line.split()[1] for line in lines}
-    assert len(after) == len(before) + 1
-    assert len(lines) == 16, "no job was done twice"
+    assert ray_fleet.restarts == 1
+    assert len((tmp_path / "begun").read_text().splitlines()) == 16, "no job was done twice"
 
 
 @pytest.mark.slow
@@ -244,7 +241,7 @@ def test_an_actor_holds_at_most_two_jobs(ray_fleet: Fleet, tmp_path: Path) -> No
     def watch(receipt: FakeReceipt) -> None:
         nonlocal most
         seats = ray_fleet._seats  # type: ignore[attr-defined]
-        most = max(most, *(len(seat.pending) for seat in seats))
+        most = max(most, *(len(seat.orders) for seat in seats))
 
     ray_fleet.run(Listed(plan(), jobs(12)), watch)
     assert most <= 2
@@ -259,4 +256,4 @@ def test_an_interrupt_leaves_no_actor_at_work(ray_fleet: Fleet, tmp_path: Path) 
             ray_fleet.run(Listed(plan(), jobs(4)), lambda receipt: os.kill(os.getpid(), signal.SIGINT))
     finally:
         signal.signal(signal.SIGINT, before)
-    assert not any(seat.pending for seat in ray_fleet._seats)  # type: ignore[attr-defined]
+    assert not any(seat.orders for seat in ray_fleet._seats)  # type: ignore[attr-defined]
