@@ -24,6 +24,7 @@ COMMANDS = {
     "export-policy": "a run's policy in half precision with its model card, to take elsewhere",
     "collect": "collect interactions into a store, without any learning",
     "train": "prior, aap, aip or alternate: train from a store alone",
+    "curve": "how much trainings find out from stored tries, between Where2Act and an oracle",
     "status": "how a run or a store stands: rate, done, left, workers",
     "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
     "store": "info, verify, digest, replay, repair, compact, merge or export: look after stores",

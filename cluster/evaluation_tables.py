@@ -7,7 +7,7 @@ again leaves the same bytes.
 import csv
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -59,17 +59,17 @@ class Table:
 def write_tables(out: Path, table: Table) -> None:
     """Write the three files; results.json comes last, so that where it is, all are."""
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / CSV_FILE, as_csv(table).encode())
+    write_atomically(out / CSV_FILE, as_csv(table.rows).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(table).encode())
     write_atomically(out / RESULTS_FILE, json.dumps(asdict(table), indent=1, allow_nan=False).encode())
 
 
-def as_csv(table: Table) -> str:
+def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """A line for each row, all columns, full precision; empty where there is no figure."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(table.rows[0]) if table.rows else [], lineterminator="\n")
+    writer = csv.DictWriter(text, list(rows[0]) if rows else [], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(table.rows)
+    writer.writerows(rows)
     return text.getvalue()
 
 

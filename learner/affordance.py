@@ -209,6 +209,7 @@ class AipAnswer:
 @torch.no_grad()
 def aap_scores(frozen: FrozenAap, questions: Questions) -> tuple[Tensor, Tensor]:
     """AAP's features of the points, [Q, feature_width], and its scores of the proposals there, [Q, S]."""
+    assert frozen.pool_features is not None, "the points asked about are those of a pool"
     features = frozen.pool_features[questions.cloud, questions.slot]
     logits = frozen.aap.action_logits(
         features[:, None], questions.point[:, None], questions.frames, questions.latents[:, None]

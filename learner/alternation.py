@@ -17,10 +17,11 @@ from typing import Protocol
 from learner import sharing
 from learner.configuration import AlternationConfig, LearnerConfig
 from learner.hardware import Hardware
-from learner.stages import DONE_FILE, StageJob, StageName, run_stage
-from shared.errors import StoreError
+from learner.recipes import ORACLE_FILE
+from learner.stages import DONE_FILE, MAX_DONE_BYTES, StageJob, StageName, run_stage
+from shared.errors import StoreError, UsageError
 from shared.files import read_bounded, write_atomically
-from shared.policy import MAX_POLICY_JSON_BYTES, Policy
+from shared.policy import Policy
 from shared.store.store import Store
 
 ALTERNATION_FILE = "alternation.json"
@@ -139,6 +140,40 @@ def newest_policy(store: Store) -> int:
     return max((plan.policy_version for plan in store.plans()), default=0)
 
 
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """Where a training left what it made.
+
+    Attributes:
+        policy: the folder of the stage whose policy is its best.
+        oracle: the file of its oracle critic, where privileged training left one.
+    """
+
+    policy: Path
+    oracle: Path | None
+
+
+def trained_in(out: Path) -> Trained:
+    """What the --out of an alternation, or of a single stage, holds.
+
+    Raises:
+        UsageError: no finished training.
+        StoreError: its record is damaged.
+    """
+    record = out / ALTERNATION_FILE
+    if record.is_file():
+        try:
+            best = int(json.loads(read_bounded(record, MAX_DONE_BYTES))["best"])
+        except (ValueError, KeyError, TypeError, RecursionError):
+            raise StoreError(f"{record}: damaged; the same training again writes it anew") from None
+        policy, oracle = out / f"aip-{best}", out / "aap-1" / ORACLE_FILE
+    else:
+        policy, oracle = out, out / ORACLE_FILE
+    if not (policy / DONE_FILE).is_file():
+        raise UsageError(f"{out}: holds no finished training; name the --out of `adaafford train alternate` or aap")
+    return Trained(policy, oracle if oracle.is_file() else None)
+
+
 def best_score(folder: Path) -> float:
     """The best validation score of a finished stage.
 
@@ -147,7 +182,7 @@ def best_score(folder: Path) -> float:
     """
     path = folder / DONE_FILE
     try:
-        return float(json.loads(read_bounded(path, MAX_POLICY_JSON_BYTES))["metrics"]["score"])
+        return float(json.loads(read_bounded(path, MAX_DONE_BYTES))["metrics"]["score"])
     except (ValueError, KeyError, TypeError, RecursionError):
         raise StoreError(f"{path}: damaged; remove the folder to train this stage again") from None
 

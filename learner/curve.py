@@ -1,13 +1,14 @@
-"""The adaptation curve: what the critics know of stored rollouts after 0, 1, 2, ... tries, between prior and oracle.
+"""The adaptation curve: what critics know of stored rollouts after 0, 1, 2, ... tries, between Where2Act and oracle.
 
-Offline: a rollout's own rows are its tries and its questions. The questions are the same after every number of tries,
-so that two figures differ by the tries alone.
+Offline: half of a rollout's own rows are candidates for tries, the other half are the questions. The questions are the
+same for all critics and after every number of tries, so that two figures differ by critic and tries alone.
 
-Shapes: R rollouts times draws, n rows of each, K the longest context, Q questions in all.
+Shapes: R rollouts times draws, n rows of each (padded), c candidates of each, K the most tries, Q questions in all.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from learner.critics import OracleScores
 from learner.data import Dataset
 from learner.frozen import FrozenAap, FrozenPrior
 from learner.losses import action_scoring_losses
-from learner.metrics import Discrimination, correlation, discrimination
+from learner.metrics import correlation
 from learner.oracle import OracleCritic
 from learner.sampling import OrderedRows, frozen_features, order_rows
 from shared.networks.aip import Aip
@@ -26,89 +27,160 @@ from shared.networks.prior import Prior
 
 _CHUNK = 16
 
+CriticKind = Literal["where2act", "random", "aip", "oracle"]
+"""Where2Act, which knows no tries; AAP after tries taken at random, or by AIP, from the candidates; the oracle, which
+is told the hidden facts."""
+
 
 @dataclass(frozen=True, slots=True)
-class CurvePoint:
-    """One critic after some tries.
+class Asked:
+    """Whose answer it is, and after how many tries."""
+
+    critic: CriticKind
+    tries: int
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """What critics say to the same questions.
 
     Attributes:
-        method: "prior", "aap" or "oracle".
-        tries: how many random tries it knows.
-        figures: on all questions.
+        labels: whether the interaction succeeded, [Q].
+        objects: whose interaction it was, [Q].
+        scores: probabilities, [Q] each.
     """
 
-    method: str
-    tries: int
-    figures: Discrimination
-
-    def closed(self, prior: "CurvePoint", oracle: "CurvePoint") -> float:
-        """The share of the gap in cross entropy between two others that this one closes."""
-        gap = prior.figures.bce - oracle.figures.bce
-        return (prior.figures.bce - self.figures.bce) / gap if gap > 0 else float("nan")
+    labels: NDArray[np.bool_]
+    objects: NDArray[np.str_]
+    scores: Mapping[Asked, NDArray[np.float32]]
 
 
-def adaptation_curve(
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Rollouts cut into what may be tried and what is asked.
+
+    Attributes:
+        ordered: R rollouts in random orders.
+        rollouts: number of the rollout, [R].
+        count: c; the rows from there on are questions.
+    """
+
+    ordered: OrderedRows
+    rollouts: tuple[int, ...]
+    count: int
+
+    @classmethod
+    def of(cls, dataset: Dataset, rollouts: Sequence[int], draws: int, seed: int) -> "Candidates":
+        """Each rollout `draws` times in other orders; those shorter than half of the longest are left out."""
+        longest = max(len(dataset.rollouts[number]) for number in rollouts)
+        enough = [number for number in rollouts if 2 * len(dataset.rollouts[number]) > longest]
+        chosen = tuple(number for number in enough for _ in range(draws))
+        ordered = order_rows(dataset, chosen, longest, np.random.default_rng(seed))
+        return cls(ordered, chosen, longest // 2)
+
+    @property
+    def rows(self) -> Tensor:
+        """Of the data set, [R, c]; all are there, since no kept rollout is shorter."""
+        return self.ordered.rows[:, : self.count]
+
+    @property
+    def questions(self) -> Tensor:
+        """Which ordered rows are asked about, [R, n]."""
+        asked = self.ordered.valid.clone()
+        asked[:, : self.count] = False
+        return asked
+
+
+def answer(
     dataset: Dataset,
-    rollouts: Sequence[int],
+    candidates: Candidates,
     frozen: FrozenAap,
-    prior: Prior | None = None,
+    prior: Prior,
+    aip: Aip | None = None,
     oracle: OracleCritic | None = None,
     tries: Sequence[int] = (0, 1, 2, 4),
-    draws: int = 4,
-    seed: int = 0,
-) -> list[CurvePoint]:
-    """Judge critics on rollouts, each `draws` times with other tries.
+) -> Answers:
+    """Ask critics about the questions.
 
     Args:
         dataset: the interactions.
-        rollouts: which ones; of objects that nothing was trained on.
+        candidates: of rollouts whose objects nothing was trained on.
         frozen: the AAP.
-        prior: Where2Act, to judge beside it.
-        oracle: a critic that is told the hidden facts, to judge beside it.
+        prior: Where2Act.
+        aip: to choose tries; None: random tries alone.
+        oracle: a critic that is told the hidden facts.
         tries: numbers of tries.
-        draws: how often tries are drawn from each rollout.
-        seed: of the draws.
     """
-    context = max(tries)
-    ordered = order_rows(dataset, [r for r in rollouts for _ in range(draws)], 1 << 16, np.random.default_rng(seed))
-    asked = ordered.valid.clone()
-    asked[:, :context] = False
-    labels = dataset.rows.success[ordered.rows][asked].numpy(force=True)
-    found = []
-    if prior is not None:
-        scores = FrozenPrior.of(prior, dataset).scores[ordered.rows[asked]].numpy(force=True)
-        found.append(CurvePoint("prior", 0, discrimination(scores, labels)))
-    logits = after_tries(dataset, frozen, ordered, list(tries))
-    for place, number in enumerate(tries):
-        scores = torch.sigmoid(logits[:, place][asked]).numpy(force=True)
-        found.append(CurvePoint("aap", number, discrimination(scores, labels)))
+    ordered, asked = candidates.ordered, candidates.questions
+    index = ordered.rows[asked]
+    owner = np.array([dataset.objects[number] for number in candidates.rollouts])
+    scores = {Asked("where2act", 0): FrozenPrior.of(prior, dataset).scores[index]}
+    most = max(tries)
+    chosen: dict[CriticKind, Tensor] = {"random": candidates.rows[:, :most]}
+    if aip is not None:
+        chosen["aip"] = tries_by_aip(dataset, candidates.rows, frozen, aip, most)
+    for critic, made in chosen.items():
+        latents = frozen.latents(made)
+        for number in tries:
+            scores[Asked(critic, number)] = _scores(dataset, ordered.rows, frozen, latents[:, number])[asked]
     if oracle is not None:
-        scores = OracleScores(oracle, dataset)(ordered.rows[asked], torch.zeros(0, dtype=torch.long)).numpy(force=True)
-        found.append(CurvePoint("oracle", 0, discrimination(scores, labels)))
-    return found
+        scores[Asked("oracle", 0)] = OracleScores(oracle, dataset)(index, torch.zeros(0, dtype=torch.long))
+    return Answers(
+        labels=dataset.rows.success[index].numpy(force=True) > 0.5,
+        objects=owner.repeat(asked.sum(dim=1).numpy()),
+        scores={whose: found.numpy(force=True) for whose, found in scores.items()},
+    )
 
 
 @torch.no_grad()
-def after_tries(dataset: Dataset, frozen: FrozenAap, ordered: OrderedRows, tries: Sequence[int]) -> Tensor:
-    """Logits of all ordered rows after some of the prefixes, [R, len(tries), n]."""
-    rows, chunks = dataset.rows, []
-    for start in range(0, len(ordered.rows), _CHUNK):
-        index = ordered.rows[start : start + _CHUNK]
-        latents = frozen.latents(index[:, : max(tries)])[:, torch.tensor(list(tries))]
-        xyz, frames = rows.xyz[index][:, None], rows.frame[index][:, None]
-        chunks.append(frozen.aap.action_logits(frozen.features[index][:, None], xyz, frames, latents[:, :, None]))
+def tries_by_aip(dataset: Dataset, candidates: Tensor, frozen: FrozenAap, aip: Aip, most: int) -> Tensor:
+    """The rows that AIP would try one after the other, each the best by its critic after those before, [R, most].
+
+    Args:
+        dataset: the interactions.
+        candidates: rows to choose from, [R, c].
+        frozen: the AAP, whose z the choice depends on.
+        aip: the chooser.
+        most: how many tries.
+    """
+    rows = dataset.rows
+    features = frozen_features(
+        aip.encoder, dataset.clouds, rows.cloud[candidates].flatten(), rows.point[candidates].flatten()
+    ).reshape(*candidates.shape, -1)
+    xyz, frames = rows.xyz[candidates], rows.frame[candidates]
+    made = candidates[:, :0]
+    free = torch.ones(candidates.shape, dtype=torch.bool)
+    for _ in range(most):
+        latents = frozen.latents(made)[:, -1:]
+        believed = torch.sigmoid(frozen.aap.action_logits(frozen.features[candidates], xyz, frames, latents))
+        gains = aip.action_scores(features, xyz, frames, latents, believed)
+        best = torch.where(free, gains, -torch.inf).argmax(dim=1, keepdim=True)
+        free.scatter_(1, best, False)
+        made = torch.cat([made, candidates.gather(1, best)], dim=1)
+    return made
+
+
+@torch.no_grad()
+def _scores(dataset: Dataset, index: Tensor, frozen: FrozenAap, latents: Tensor) -> Tensor:
+    """AAP's scores of rows, [R, n], after z, [R, latent_width]; in chunks, to bound memory."""
+    chunks = []
+    for start in range(0, len(index), _CHUNK):
+        part = index[start : start + _CHUNK]
+        xyz, frames = dataset.rows.xyz[part], dataset.rows.frame[part]
+        z = latents[start : start + _CHUNK, None]
+        chunks.append(torch.sigmoid(frozen.aap.action_logits(frozen.features[part], xyz, frames, z)))
     return torch.cat(chunks)
 
 
 @dataclass(frozen=True, slots=True)
 class ProposalGain:
-    """How much the loss on the questions drops by the next try, nats, on the mean over rollouts and contexts.
+    """How much the loss on the questions drops by the next try, nats, on the mean over rollouts.
 
     Attributes:
         before: tries that were made at random before.
-        random: by a random row of the rollout.
-        aip: by the row with the highest AIP score.
-        greedy: by the row that lowers it most, which only hindsight knows.
+        random: by a random candidate.
+        aip: by the candidate with the highest AIP score.
+        greedy: by the candidate that lowers it most, which only hindsight knows.
         loss: on the questions before the try.
         correlation: of AIP scores with drops.
     """
@@ -123,24 +195,17 @@ class ProposalGain:
 
 @torch.no_grad()
 def proposal_gains(
-    dataset: Dataset,
-    rollouts: Sequence[int],
-    frozen: FrozenAap,
-    aip: Aip,
-    before: Sequence[int] = (0, 1, 2),
-    draws: int = 4,
-    seed: int = 0,
+    dataset: Dataset, candidates: Candidates, frozen: FrozenAap, aip: Aip, before: Sequence[int] = (0, 1, 2)
 ) -> list[ProposalGain]:
-    """Whether the AIP critic picks better tries than chance among the rows that a rollout happens to have.
-
-    Half of the rows are questions; the others are candidates for the next try.
-    """
-    ordered = order_rows(dataset, [r for r in rollouts for _ in range(draws)], 1 << 16, np.random.default_rng(seed))
-    features = frozen_features(aip.encoder, dataset.clouds, dataset.rows.cloud, dataset.rows.point)
-    found = []
+    """Whether the AIP critic picks better tries than chance among the candidates that a rollout happens to have."""
+    rows = dataset.rows
+    features = frozen_features(aip.encoder, dataset.clouds, rows.cloud, rows.point)
+    ordered, found = candidates.ordered, []
     for number in before:
         parts = [
-            _gains_of(dataset, frozen, aip, features, ordered.rows[place][ordered.valid[place]], number)
+            _gains_of(
+                dataset, frozen, aip, features, ordered.rows[place][ordered.valid[place]], candidates.count, number
+            )
             for place in range(len(ordered.rows))
         ]
         drops, scores = [part[0] for part in parts], [part[1] for part in parts]
@@ -158,11 +223,10 @@ def proposal_gains(
 
 
 def _gains_of(
-    dataset: Dataset, frozen: FrozenAap, aip: Aip, features: Tensor, rows: Tensor, before: int
+    dataset: Dataset, frozen: FrozenAap, aip: Aip, features: Tensor, rows: Tensor, count: int, before: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
     """Drops of the loss and AIP scores of a rollout's candidates, and the loss before."""
-    half = len(rows) // 2
-    made, candidates, questions = rows[:before], rows[before:half], rows[half:]
+    made, candidates, questions = rows[:before], rows[before:count], rows[count:]
     several = torch.cat([made.expand(len(candidates), before), candidates[:, None]], dim=1)
     latent = frozen.latents(made[None])[0, -1]
     latents = torch.cat([latent[None], frozen.latents(several)[:, -1]])
@@ -171,9 +235,8 @@ def _gains_of(
         frozen.features[questions], data.xyz[questions], data.frame[questions], latents[:, None]
     )
     losses = action_scoring_losses(logits, data.success[questions]).mean(dim=1)
-    tried = candidates
     believed = torch.sigmoid(
-        frozen.aap.action_logits(frozen.features[tried], data.xyz[tried], data.frame[tried], latent)
+        frozen.aap.action_logits(frozen.features[candidates], data.xyz[candidates], data.frame[candidates], latent)
     )
-    scores = aip.action_scores(features[tried], data.xyz[tried], data.frame[tried], latent, believed)
+    scores = aip.action_scores(features[candidates], data.xyz[candidates], data.frame[candidates], latent, believed)
     return (losses[0] - losses[1:]).numpy(force=True), scores.numpy(force=True), float(losses[0])

@@ -42,25 +42,25 @@ class FrozenAap:
     Attributes:
         aap: frozen.
         features: f_p|O of the rows, [I, feature_width].
-        pool_features: f_p|O of the pool's points, [O, P, feature_width].
+        pool_features: f_p|O of the pool's points, [O, P, feature_width]; None where no pool was given.
         codes: z_I of the rows, [I, latent_width].
         weights: w_I of the rows, [I].
     """
 
     aap: Aap
     features: Tensor
-    pool_features: Tensor
+    pool_features: Tensor | None
     codes: Tensor
     weights: Tensor
 
     @classmethod
     @torch.no_grad()
-    def of(cls, aap: Aap, dataset: Dataset, pool: ProposalPool) -> "FrozenAap":
+    def of(cls, aap: Aap, dataset: Dataset, pool: ProposalPool | None = None) -> "FrozenAap":
         """Encode everything."""
         aap.eval().requires_grad_(False)
         rows = dataset.rows
         features = frozen_features(aap.encoder, dataset.clouds, rows.cloud, rows.point)
-        pool_features = pool.features_under(aap.encoder, dataset.clouds)
+        pool_features = None if pool is None else pool.features_under(aap.encoder, dataset.clouds)
         codes, weights = aap.interaction_codes(features, rows.xyz, rows.frame, rows.motion, rows.success)
         return cls(aap, features, pool_features, codes, weights)
 

@@ -91,10 +91,13 @@ def best_f_score(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> floa
 
 def cross_entropy(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:
     """Mean binary cross entropy, nats."""
-    if not len(labels):
-        return float("nan")
+    return float(cross_entropies(scores, labels).mean()) if len(labels) else float("nan")
+
+
+def cross_entropies(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Binary cross entropy of each row, nats, [I]; bounded, since a score may be 0 or 1."""
     clipped = np.clip(scores, _MIN_PROBABILITY, 1.0 - _MIN_PROBABILITY)
-    return float(-np.log(np.where(labels, clipped, 1.0 - clipped)).mean())
+    return np.asarray(-np.log(np.where(labels, clipped, 1.0 - clipped)))
 
 
 def calibration_error(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> float:

@@ -21,12 +21,12 @@ from pathlib import Path
 from learner import sharing
 from learner.checkpoint import check_fingerprint, read_cursor
 from learner.configuration import LearnerConfig
-from learner.data import load_dataset, split, without_later
+from learner.data import Dataset, Split, load_dataset, split, without_later
 from learner.hardware import Hardware
 from learner.names import METRICS_FILE
 from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FOLDER, Recipe, Runner
 from learner.training import CHECKPOINT_FILE, TrainingResult, without_nan
-from shared.errors import UsageError
+from shared.errors import StoreError, UsageError
 from shared.files import read_bounded, write_atomically
 from shared.methods import ModuleName
 from shared.policy import (
@@ -42,6 +42,8 @@ from shared.store.store import Store
 
 DONE_FILE = "done.json"
 CONFIG_FILE = "config.json"
+MAX_DONE_BYTES = 16 << 20
+"""done.json names every object that was seen, in some 70 bytes each."""
 CHECKPOINT_FOLDERS = ("", ORACLE_FOLDER, AFFORDANCE_FOLDER)
 
 StageName = ModuleName
@@ -124,20 +126,44 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
     policy.modules().to("cpu")
     policy.with_trained(job.stage)
     if sharing.rank() == 0:
-        _finish(job, policy, result, fingerprint)
+        _finish(job, policy, result, fingerprint, _seen(job, store, dataset, parts))
     sharing.wait_for_all()
     _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
     return policy
 
 
-def _finish(job: StageJob, policy: Policy, result: TrainingResult, fingerprint: str) -> None:
+def _finish(job: StageJob, policy: Policy, result: TrainingResult, fingerprint: str, seen: Collection[str]) -> None:
     """Write what the stage made, and clear away what only it needed."""
     for name, data in policy.to_files().items():
         write_atomically(job.out / name, data)
     done = {"stage": job.stage, "fingerprint": fingerprint, **asdict(result), "metrics": without_nan(result.metrics)}
+    done["objects"] = sorted(seen)
     write_atomically(job.out / DONE_FILE, json.dumps(done, indent=1).encode())
     for folder in CHECKPOINT_FOLDERS:
         (job.out / folder / CHECKPOINT_FILE).unlink(missing_ok=True)
+
+
+def _seen(job: StageJob, store: Store, dataset: Dataset, parts: Split) -> frozenset[str]:
+    """Content hashes of all objects that this stage and those before it learned from or were judged by."""
+    names = {dataset.objects[number] for number in (*parts.train, *parts.validation)}
+    before = objects_seen(job.init) if job.init is not None else frozenset()
+    return before | {ref.content_hash for ref in store.setting.objects if ref.id in names}
+
+
+def objects_seen(folder: Path) -> frozenset[str]:
+    """Content hashes of the objects that a finished stage's policy has seen; none, where the folder does not say.
+
+    Raises:
+        StoreError: its done.json is damaged.
+    """
+    path = folder / DONE_FILE
+    if not path.is_file():
+        return frozenset()
+    try:
+        found = json.loads(read_bounded(path, MAX_DONE_BYTES)).get("objects", [])
+        return frozenset(str(name) for name in found)
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        raise StoreError(f"{path}: damaged; remove the folder to train this stage again") from None
 
 
 def _say(line: str) -> None:
@@ -204,7 +230,7 @@ def _check_checkpoints(out: Path, fingerprint: str) -> None:
 
 def _check_done(path: Path, fingerprint: str) -> None:
     try:
-        found = json.loads(read_bounded(path, MAX_POLICY_JSON_BYTES))["fingerprint"]
+        found = json.loads(read_bounded(path, MAX_DONE_BYTES))["fingerprint"]
     except (ValueError, KeyError, TypeError, RecursionError):
         found = None
     if found != fingerprint:

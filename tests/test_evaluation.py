@@ -81,7 +81,7 @@ def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     shown = as_markdown(table_of())
     assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | - | 0 |" in shown
     assert "30.0% succeed" in shown
-    read = list(csv.DictReader(io.StringIO(as_csv(table_of()))))
+    read = list(csv.DictReader(io.StringIO(as_csv(table_of().rows))))
     assert (read[0]["f_score"], read[0]["auc"]) == ("0.5", "")
 
 

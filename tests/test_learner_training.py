@@ -16,8 +16,9 @@ from learner.aap import AapStage, OracleStage, predict
 from learner.affordance import AapAnswer, AffordanceStage, AipAnswer, Answer, PriorAnswer
 from learner.aip import AipStage
 from learner.checkpoint import Cursor
+from learner.comparison import curve_rows, rows_of
 from learner.configuration import AapConfig, AffordanceConfig, AipConfig, LearnerConfig, PriorConfig, TrainingConfig
-from learner.curve import adaptation_curve, proposal_gains
+from learner.curve import Answers, Asked, Candidates, answer, proposal_gains, tries_by_aip
 from learner.data import Dataset, Split, load_dataset
 from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
 from learner.frozen import FrozenAap
@@ -163,24 +164,54 @@ def test_the_curve_falls_where_tries_tell_and_greedy_beats_chance(coin_dataset: 
     policy, pool = fresh(coin_dataset)
     descend(AapStage(policy.aap, coin_dataset, EVERYTHING, AapConfig(context=4, batch_rollouts=8)), 40)
     frozen = FrozenAap.of(policy.aap, coin_dataset, pool)
-    oracle = OracleCritic(policy.aap)
     rollouts = EVERYTHING.validation
-    curve = adaptation_curve(coin_dataset, rollouts, frozen, policy.prior, oracle, (0, 1, 4), draws=2)
-    assert [(point.method, point.tries) for point in curve] == [
-        ("prior", 0),
-        ("aap", 0),
-        ("aap", 1),
-        ("aap", 4),
+    candidates = Candidates.of(coin_dataset, rollouts, draws=2, seed=0)
+    oracle = OracleCritic(policy.aap)
+    answers = answer(coin_dataset, candidates, frozen, policy.prior, policy.aip, oracle, (0, 1, 4))
+    # Half of the 12 rows of two draws of each rollout, the same whatever was tried.
+    assert len(answers.labels) == len(answers.objects) == len(rollouts) * 2 * 6
+    rows = {(row.critic, row.tries): row for row in rows_of("coins", "", [answers])}
+    assert list(rows) == [
+        ("where2act", 0),
+        *((critic, tries) for critic in ("random", "aip") for tries in (0, 1, 4)),
         ("oracle", 0),
     ]
-    # The last rows of two draws of each rollout, the same whatever was tried.
-    assert {point.figures.rows for point in curve} == {len(rollouts) * 2 * (12 - 4)}
-    assert curve[2].figures.bce < curve[1].figures.bce
-    assert curve[2].closed(curve[1], curve[3]) > 0
-    first, second = proposal_gains(coin_dataset, rollouts, frozen, policy.aip, (0, 1), draws=2)
+    assert rows["random", 1].bce < rows["random", 0].bce
+    assert rows["random", 0].bce == rows["aip", 0].bce
+    first, second = proposal_gains(coin_dataset, candidates, frozen, policy.aip, (0, 1))
     assert all(gain.greedy >= max(gain.random, gain.aip) for gain in (first, second))
     assert first.random > 0
     assert second.loss < first.loss
+
+
+def test_gaps_are_closed_from_none_to_all_and_runs_pooled() -> None:
+    labels = np.array([True, False, True, False])
+    scores = {
+        Asked("where2act", 0): [0.5, 0.5, 0.5, 0.5],
+        Asked("random", 0): [0.6, 0.4, 0.6, 0.4],
+        Asked("random", 1): [0.9, 0.1, 0.9, 0.1],
+        Asked("oracle", 0): [0.9, 0.1, 0.9, 0.1],
+    }
+    answers = Answers(labels, np.array(["a", "a", "b", "c"]), {k: np.array(v) for k, v in scores.items()})
+    rows = curve_rows("coins", [("seed-1", answers), ("seed-2", answers)])
+    assert [row.run for row in rows] == [""] * 4 + ["seed-1"] * 4 + ["seed-2"] * 4
+    prior, none, one, oracle = rows[:4]
+    assert (prior.closed, one.closed, oracle.closed) == pytest.approx((0, 1, 1))
+    assert (none.closed_from_none, one.closed_from_none) == pytest.approx((0, 1))
+    assert none.closed == pytest.approx(np.log(0.5 / 0.6) / np.log(0.5 / 0.9))
+    assert none.closed_low == pytest.approx(none.closed_high)
+    assert (prior.questions, prior.objects, rows[4].questions) == (8, 3, 4)
+    assert [row.bce for row in rows[:4]] == pytest.approx([row.bce for row in rows[4:8]])
+
+
+def test_aip_chooses_each_candidate_once_and_the_best_by_its_critic(coin_dataset: Dataset) -> None:
+    policy, pool = fresh(coin_dataset)
+    frozen = FrozenAap.of(policy.aap, coin_dataset, pool)
+    candidates = Candidates.of(coin_dataset, EVERYTHING.validation, draws=1, seed=0)
+    made = tries_by_aip(coin_dataset, candidates.rows, frozen, policy.aip, candidates.count)
+    assert torch.equal(made.sort(dim=1).values, candidates.rows.sort(dim=1).values)
+    again = tries_by_aip(coin_dataset, candidates.rows.flip(1), frozen, policy.aip, 2)
+    assert torch.equal(again, made[:, :2])
 
 
 def test_gains_are_differences_of_the_loss_on_the_same_rows(coin_dataset: Dataset) -> None:

@@ -1,0 +1,187 @@
+"""Adaptation curves of finished trainings, as curve.json, curve.csv, curve.md, and curve.png to look at."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from cluster.evaluation_tables import as_csv
+from learner.comparison import CurveRow
+from learner.curve import ProposalGain
+from shared.files import write_atomically
+
+JSON_FILE, CSV_FILE, MARKDOWN_FILE, FIGURE_FILE = "curve.json", "curve.csv", "curve.md", "curve.png"
+CRITICS = {
+    "where2act": "Where2Act",
+    "random": "AAP, random tries",
+    "aip": "AAP, tries by AIP",
+    "oracle": "oracle, told the hidden facts",
+}
+_STYLES = {"random": ("tab:blue", "o"), "aip": ("tab:orange", "s")}
+_LINES = ("-", "--", ":", "-.")
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """What came of judging some trainings on a store.
+
+    Attributes:
+        task: of the store.
+        digest: of the store's content.
+        rollouts: how many were judged on, of objects that no training had seen.
+        left_out: rollouts of the store that were not, for their objects had been seen.
+        draws: how often tries and questions were drawn from each rollout.
+        rows: of all trainings.
+        gains: of the first run of each training that has an AIP, by its name.
+    """
+
+    task: str
+    digest: str
+    rollouts: int
+    left_out: int
+    draws: int
+    rows: tuple[CurveRow, ...]
+    gains: Mapping[str, Sequence[ProposalGain]]
+
+
+def write_curves(out: Path, curves: Curves) -> None:
+    """Write the four files; curve.json comes last."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows = [_plain(asdict(row)) for row in curves.rows]
+    write_atomically(out / CSV_FILE, as_csv(rows).encode())
+    write_atomically(out / MARKDOWN_FILE, as_markdown(curves).encode())
+    draw_curves(curves, out / FIGURE_FILE)
+    write_atomically(out / JSON_FILE, json.dumps(as_json(curves), indent=1, allow_nan=False).encode())
+
+
+def as_json(curves: Curves) -> dict[str, Any]:
+    """All of it as JSON has it; null for no figure."""
+    found = asdict(curves)
+    found["rows"] = [_plain(row) for row in found["rows"]]
+    found["gains"] = {name: [_plain(asdict(gain)) for gain in gains] for name, gains in curves.gains.items()}
+    return found
+
+
+def as_markdown(curves: Curves) -> str:
+    """Tables of all runs together, and what each next try tells."""
+    pooled = [row for row in curves.rows if not row.run]
+    base_rate = pooled[0].base_rate
+    lines = [
+        f"# {curves.task}: what critics know after some tries",
+        "",
+        f"{curves.rollouts} stored rollouts on {pooled[0].objects} objects that no training saw, each drawn "
+        f"{curves.draws} times: half of its interactions may be tried, the other half is asked about; "
+        f"{100 * base_rate:.1f}% of these succeed. F-score at threshold 0.5. Gap closed: of that in cross entropy "
+        "between Where2Act and the oracle, which is told the hidden facts; in the last column, between AAP without "
+        "tries and the oracle. In brackets: 95% bootstrap intervals over objects, all seeds together. Digest of the "
+        f"interactions: `{curves.digest[:16]}`.",
+        "",
+        "| training | critic | tries | F-score | gap closed | best F | BCE | AUC | ECE | from no tries |",
+        "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for row in pooled:
+        cells = [
+            row.name,
+            CRITICS[row.critic],
+            str(row.tries),
+            _percent(row.f_score, row.f_score_low, row.f_score_high),
+            _percent(row.closed, row.closed_low, row.closed_high),
+            _percent(row.best_f_score),
+            f"{row.bce:.4f}",
+            f"{row.auc:.3f}",
+            f"{row.calibration_error:.3f}",
+            _percent(row.closed_from_none),
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += ["", "By run (F-score / gap closed):", "", *_by_run(curves.rows)]
+    for name, gains in curves.gains.items():
+        lines += [
+            "",
+            f"Drop of the loss on the questions by the next try, in thousandths of a nat ({name}, its first run):",
+            "",
+            "| tries | by a random one | by AIP's choice | by the best, in hindsight | loss before | correlation |",
+            "| ---: | ---: | ---: | ---: | ---: | ---: |",
+        ]
+        lines += [
+            f"| {g.before} | {1e3 * g.random:.1f} | {1e3 * g.aip:.1f} | {1e3 * g.greedy:.1f} | {1e3 * g.loss:.0f} | "
+            f"{g.correlation:.2f} |"
+            for g in gains
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _by_run(rows: Sequence[CurveRow]) -> list[str]:
+    """A line for each run, a column for each critic and number of tries."""
+    asked = list(dict.fromkeys((row.critic, row.tries) for row in rows))
+    runs = list(dict.fromkeys((row.name, row.run) for row in rows if row.run))
+    found = {(row.name, row.run, row.critic, row.tries): row for row in rows}
+    lines = [
+        "| training | run | " + " | ".join(f"{critic} {tries}" for critic, tries in asked) + " |",
+        "| --- | --- |" + " ---: |" * len(asked),
+    ]
+    for name, run in runs:
+        cells = []
+        for critic, tries in asked:
+            row = found.get((name, run, critic, tries))
+            cells.append("-" if row is None else f"{_percent(row.f_score)} / {_percent(row.closed)}")
+        lines.append(f"| {name} | {run} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def draw_curves(curves: Curves, path: Path) -> None:
+    """F-score and the share of the gap that is closed against the number of tries, with intervals over objects."""
+    figure = Figure(figsize=(10, 4.2), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    pooled = [row for row in curves.rows if not row.run]
+    names = list(dict.fromkeys(row.name for row in pooled))
+    for place, name in enumerate(names):
+        own = [row for row in pooled if row.name == name]
+        line = _LINES[place % len(_LINES)]
+        for critic, (colour, marker) in _STYLES.items():
+            made = [row for row in own if row.critic == critic]
+            if not made:
+                continue
+            tries, label = [row.tries for row in made], f"{CRITICS[critic]} ({name})"
+            for axes, figure_name in ((left, "f_score"), (right, "closed")):
+                low, high = ([getattr(row, f"{figure_name}_{end}") for row in made] for end in ("low", "high"))
+                axes.plot(
+                    tries, [getattr(row, figure_name) for row in made], line, color=colour, marker=marker, label=label
+                )
+                axes.fill_between(tries, low, high, color=colour, alpha=0.12, linewidth=0)
+    _bounds(left, [row for row in pooled if row.name == names[0]])
+    right.axhline(0.0, color="0.5", linewidth=1)
+    right.axhline(1.0, color="black", linewidth=1)
+    left.set_ylabel("F-score at threshold 0.5")
+    right.set_ylabel("share of the gap in cross entropy that is closed")
+    for axes in (left, right):
+        axes.set_xlabel("tries")
+        axes.grid(alpha=0.3)
+    left.legend(fontsize=7)
+    figure.suptitle(f"{curves.task}: {pooled[0].objects} objects not seen in training", fontsize=10)
+    figure.savefig(path, format="png")
+
+
+def _bounds(axes: Axes, rows: Sequence[CurveRow]) -> None:
+    """Where2Act and the oracle as level lines."""
+    for row in rows:
+        if row.critic in ("where2act", "oracle"):
+            colour = "0.5" if row.critic == "where2act" else "black"
+            axes.axhline(row.f_score, color=colour, linewidth=1, label=CRITICS[row.critic])
+
+
+def _percent(value: float, low: float = math.nan, high: float = math.nan) -> str:
+    if math.isnan(value):
+        return "-"
+    return f"{100 * value:.1f}" + ("" if math.isnan(low) else f" [{100 * low:.1f}, {100 * high:.1f}]")
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """NaN as None."""
+    return {name: None if isinstance(v, float) and math.isnan(v) else v for name, v in values.items()}
