@@ -2,7 +2,6 @@
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,9 @@ from cluster.progress import CollectionProgress, Tally
 from cluster.status import DriverStatus, State, StatusKeeper
 from shared.errors import WorkerError
 from shared.files import process_name
-from shared.plan import Plan, missing_ranges
+from shared.plan import Plan, covered, missing_ranges
 from shared.reproduction import reproduction
-from shared.store import ShardManifest, Store
+from shared.store import Store
 
 OpenFleet = Callable[[], Fleet]
 
@@ -78,8 +77,8 @@ def collect(
     store.sweep()
     if isinstance(plan, Plan):
         store.add_plan(plan)
-    held = _shards(store, plan)
-    missing = missing_ranges(rollouts, [(shard.start, shard.stop) for shard in held])
+    held = {key: [(job.start, job.stop) for job in store.jobs(key)] for key in _plan_keys(store, plan)}
+    missing = missing_ranges(rollouts, [each for ranges in held.values() for each in ranges])
     already = rollouts - sum(stop - start for start, stop in missing)
     progress = CollectionProgress(f"collecting {plan.key}", already, rollouts, store.where)
     with progress:
@@ -88,9 +87,7 @@ def collect(
         fleet = open_fleet()
         version, per_version = (plan.policy_version, None) if isinstance(plan, Plan) else (None, plan.per_version)
         in_force = PlanInForce(store, plan.proposer, version, _Adopting(store, fleet))
-        counts: Counter[str] = Counter()
-        for shard in held:
-            counts[shard.plan_key] += shard.rollouts
+        counts = {key: covered(ranges) for key, ranges in held.items()}
         series = Series(in_force, missing, per_shard, per_version, counts)
         standing = _Standing(plan.key, already, rollouts, progress, fleet, in_force)
         try:
@@ -104,12 +101,11 @@ def collect(
     return Collected(progress.tally, progress.elapsed_s, fleet.workers)
 
 
-def _shards(store: Store, plan: Plan | Newest) -> list[ShardManifest]:
-    """What is committed of a plan, or of a proposer with any policy."""
+def _plan_keys(store: Store, plan: Plan | Newest) -> list[str]:
+    """The plan, or all of a proposer with any policy."""
     if isinstance(plan, Plan):
-        return store.committed(plan.key)
-    keys = [known.key for known in store.plans() if known.proposer == plan.proposer]
-    return [shard for key in keys for shard in store.committed(key)]
+        return [plan.key]
+    return [known.key for known in store.plans() if known.proposer == plan.proposer]
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +157,8 @@ class _Standing:
 
 def _report_quarantined(store: Store, plan: Plan | Newest) -> None:
     """Say which rollouts were given up, why, and how to see it happen."""
-    given_up = [each for shard in _shards(store, plan) for each in shard.quarantined]
+    shards = (shard for key in _plan_keys(store, plan) for shard in store.committed(key))
+    given_up = [each for shard in shards for each in shard.quarantined]
     logger.warning("%d rollouts of %s are quarantined; `adaafford store info` lists them", len(given_up), plan.key)
     for each in given_up[:MOST_REPORTED]:
         logger.warning("rollout %d: %s; alone: %s", each.rollout, each.reason, each.command)

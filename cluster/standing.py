@@ -16,7 +16,7 @@ from cluster.run_folder import RunFolder
 from cluster.status import DriverStatus, read_status
 from learner.names import METRICS_FILE, PUBLISHED_FILE
 from shared.errors import UsageError
-from shared.plan import Job, missing_ranges
+from shared.plan import Job, covered
 from shared.store import Store
 from shared.store.layout import SHARDS_FOLDER, STORE_FILE, parse_shard_id
 from shared.store.place import is_url
@@ -158,11 +158,7 @@ def _rollouts(store: Store) -> dict[str, int]:
     ranges: dict[str, list[tuple[int, int]]] = {}
     for job in _jobs(store):
         ranges.setdefault(job.plan_key, []).append((job.start, job.stop))
-    counts = {}
-    for plan_key, known in sorted(ranges.items()):
-        end = max(stop for _, stop in known)
-        counts[plan_key] = end - sum(stop - start for start, stop in missing_ranges(end, known))
-    return counts
+    return {plan_key: covered(known) for plan_key, known in sorted(ranges.items())}
 
 
 def _jobs(store: Store) -> Iterable[Job]:

@@ -68,7 +68,7 @@ class WorkerActor:
             policy: likewise to the weights of the plan's policy; empty if it uses none.
             quarantined: rollouts of the job that are not to be executed, and why.
         """
-        # The job after one that failed is here already; it would overwrite the breadcrumb before the driver has seen it.
+        # The job behind one that failed is here already, and would hide its breadcrumb before the driver has seen it.
         if self._broken:
             raise RuntimeError("the job before this one failed, and the process is about to be replaced")
         self._broken = True

@@ -111,8 +111,10 @@ class Worker:
         if plan.policy_version:
             # Beside the version in each row this says how far that was behind, where collection follows a learner.
             provenance["newest_policy"] = str(max(self._store.policy_versions(), default=0))
+        # A driver holds a store on a disk alone, and has seen what is missing; of a bucket there may be several.
+        vetted = not self._store.place.writes_in_place
         with clock.stage("write"):
-            self._store.commit(plan, job, records, provenance, self._explain(job, quarantined))
+            self._store.commit(plan, job, records, provenance, self._explain(job, quarantined), vetted=vetted)
         clock.seconds["total"] = time.perf_counter() - begun
         return _receipt(job, records, dict(clock.seconds))
 

@@ -99,6 +99,15 @@ def missing_ranges(rollouts: int, done: Iterable[tuple[int, int]]) -> list[tuple
     return [(begin, stop) for begin, stop in [*gaps, (start, rollouts)] if begin < stop]
 
 
+def covered(ranges: Iterable[tuple[int, int]]) -> int:
+    """How many numbers lie in some half-open ranges, which may overlap."""
+    count = end = 0
+    for low, high in sorted(ranges):
+        count += max(high - max(low, end), 0)
+        end = max(end, high)
+    return count
+
+
 def missing_jobs(plan_key: str, rollouts: int, done: list[tuple[int, int]], per_shard: int) -> list[Job]:
     """Jobs for the rollouts in [0, `rollouts`) that no committed range in `done` covers.
 

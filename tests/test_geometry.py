@@ -13,7 +13,7 @@ from shared.geometry import (
     rotation_from_quaternion,
     view_from_world,
 )
-from shared.plan import missing_jobs
+from shared.plan import covered, missing_jobs
 from shared.seeds import generator, torch_seed
 from tests.single_door import door
 
@@ -73,11 +73,17 @@ def test_seeds_depend_on_the_purpose_and_on_nothing_else() -> None:
     assert 0 <= torch_seed(7, "aap") < 2**63
 
 
+@given(st.lists(st.tuples(st.integers(0, 30), st.integers(1, 9))))
+def test_what_ranges_cover_is_counted_once(ranges: list[tuple[int, int]]) -> None:
+    halves = [(low, low + width) for low, width in ranges]
+    assert covered(halves) == len({index for low, high in halves for index in range(low, high)})
+
+
 @given(st.integers(0, 60), st.sets(st.integers(0, 11)), st.integers(1, 9))
 def test_missing_jobs_cover_what_is_missing_once(rollouts: int, shards: set[int], per_shard: int) -> None:
     done = [(5 * k, 5 * k + 5) for k in shards]
     jobs = missing_jobs("random-v0", rollouts, done, per_shard)
-    covered = [index for job in jobs for index in range(job.start, job.stop)]
+    given_out = [index for job in jobs for index in range(job.start, job.stop)]
     have = {index for low, high in done for index in range(low, high)}
-    assert sorted(covered) == sorted(set(range(rollouts)) - have)
+    assert sorted(given_out) == sorted(set(range(rollouts)) - have)
     assert all(0 < job.stop - job.start <= per_shard for job in jobs)

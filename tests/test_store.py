@@ -203,6 +203,21 @@ def test_overlapping_ranges_of_a_plan_are_refused(tmp_path: Path, start: int, st
     assert not list(store.path.rglob(".tmp-*"))
 
 
+def test_what_a_driver_has_vetted_is_not_looked_for_and_counts_once_all_the_same(tmp_path: Path) -> None:
+    store = make(tmp_path / "store", (0, 4))
+    job = Job(PLAN.key, 2, 6)
+    store.commit(PLAN, job, fabricate_rollouts(PLAN, job), {}, vetted=True)
+    assert store.digest() == make(tmp_path / "whole", (0, 6)).digest()
+
+
+def test_jobs_are_known_by_name_alone(tmp_path: Path) -> None:
+    store = make(tmp_path / "store", (0, 2), (4, 7))
+    (store.shards_folder / Job(PLAN.key, 2, 4).shard_id).mkdir()
+    (store.shards_folder / Job(PLAN.key, 0, 2).shard_id / "manifest.json").write_text("damaged")
+    assert store.jobs() == store.jobs(PLAN.key) == [Job(PLAN.key, 0, 2), Job(PLAN.key, 4, 7)]
+    assert store.jobs("aip-v1") == []
+
+
 def test_plans_do_not_get_in_each_others_way(tmp_path: Path) -> None:
     other = Plan(setting=SETTING, proposer="aip", policy_version=1)
     store = make(tmp_path / "store", (0, 2))

@@ -64,6 +64,14 @@ def test_names_and_leaves_are_those_of_a_folder(place: Place) -> None:
     assert place.leaves("nothing") == []
 
 
+def test_names_from_one_on_come_in_order(place: Place) -> None:
+    for name in "abcd":
+        place.publish(publication({"x/y": b"1", "z": b"2"}, f"shards/{name}1"))
+    assert list(place.names_from("shards", "b")) == ["b1", "c1", "d1"]
+    assert list(place.names_from("shards", "b2")) == ["c1", "d1"]
+    assert list(place.names_from("shards", "e")) == []
+
+
 def test_more_names_than_one_page_are_listed(s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shared.store.bucket.PAGE", 3)
     place = place_of(s3_url)
@@ -123,8 +131,9 @@ def test_a_store_is_the_same_wherever_it_lies(where: str, tmp_path: Path) -> Non
     assert info(store).rollouts == 5
     assert store.plans() == (PLAN,)
     assert verify(store) == []
-    with pytest.raises(StoreError, match="overlaps"):
-        store.commit(PLAN, Job(PLAN.key, 1, 3), fabricate_rollouts(PLAN, Job(PLAN.key, 1, 3)), {})
+    for clash in (Job(PLAN.key, 1, 3), Job(PLAN.key, 4, 6)):
+        with pytest.raises(StoreError, match="overlaps"):
+            store.commit(PLAN, clash, fabricate_rollouts(PLAN, clash), {})
     with pytest.raises(StoreError, match="seed: the store has 7, given 8"):
         Store.create(where, fabricate_setting(seed=8))
 

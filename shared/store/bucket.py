@@ -119,6 +119,17 @@ class BucketPlace:
         keys = [*found["common_prefixes"], *(entry["path"] for entry in found["objects"])]
         return sorted({key.rstrip("/").rpartition("/")[2] for key in keys})
 
+    def names_from(self, folder: str, first: str) -> Iterator[str]:
+        """See `Place.names_from`; some pages of keys, however many there are before and after."""
+        pages = self._client.list(f"{folder}/", offset=f"{folder}/{first}", chunk_size=PAGE)
+        last = ""
+        while page := self._ask(lambda: next(pages, None), folder):
+            for entry in page:
+                name = entry["path"].removeprefix(f"{folder}/").partition("/")[0]
+                if name != last:
+                    yield name
+                last = name
+
     def leaves(self, folder: str) -> list[str]:
         """See `Place.leaves`."""
         pages = self._ask(lambda: list(self._client.list(folder or None, chunk_size=PAGE)), folder)

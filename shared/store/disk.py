@@ -1,5 +1,6 @@
 """A store in a folder of a disk: written beside, forced to the disk, renamed into place."""
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -61,7 +62,11 @@ class DiskPlace:
     def names(self, folder: str) -> list[str]:
         """See `Place.names`."""
         path = self._at(folder)
-        return sorted(entry.name for entry in path.iterdir()) if path.is_dir() else []
+        return sorted(os.listdir(path)) if path.is_dir() else []  # noqa: PTH208 - twice as fast, and there may be millions.
+
+    def names_from(self, folder: str, first: str) -> Iterator[str]:
+        """See `Place.names_from`; a disk has no order of names, so all are listed."""
+        return (name for name in self.names(folder) if name >= first)
 
     def leaves(self, folder: str) -> list[str]:
         """See `Place.leaves`."""
@@ -113,9 +118,13 @@ class DiskPlace:
 
     def sweep(self, folders: Sequence[str]) -> int:
         """See `Place.sweep`."""
-        paths = [self._at(folder) for folder in folders]
-        remnants = [path for folder in paths if folder.is_dir() for path in folder.glob(f"{TEMPORARY_PREFIX}*")]
-        return sum(remove_if_abandoned(remnant) for remnant in remnants)
+        remnants = [
+            self._at(folder) / name
+            for folder in folders
+            for name in self.names(folder)
+            if name.startswith(TEMPORARY_PREFIX)
+        ]
+        return sum(map(remove_if_abandoned, remnants))
 
     @contextmanager
     def only_one(self, name: str) -> Iterator[None]:

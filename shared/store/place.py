@@ -78,6 +78,10 @@ class Place(Protocol):
         """What lies directly in a folder ("" is the store itself), in order; nothing if the folder is not there."""
         ...
 
+    def names_from(self, folder: str, first: str) -> Iterator[str]:
+        """What lies directly in a folder and is not before `first`, in order, asked for as it is consumed."""
+        ...
+
     def leaves(self, folder: str) -> list[str]:
         """Keys of everything below a folder that holds nothing itself, in order."""
         ...

@@ -65,6 +65,11 @@ def committed_shards(place: Place, plan_key: str | None = None) -> list[Folder]:
     return [folder for folder, is_there in zip(folders, there, strict=True) if is_there]
 
 
+def committed_jobs(place: Place, plan_key: str | None = None) -> list[Job]:
+    """The jobs whose shards are committed, by the shards' names alone."""
+    return [job for folder in committed_shards(place, plan_key) if (job := parse_shard_id(folder.name)) is not None]
+
+
 def read_manifests(shards: Sequence[Folder]) -> list[ShardManifest]:
     """The manifests of some committed shards of one place.
 

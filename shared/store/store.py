@@ -180,6 +180,13 @@ class Store:
         """
         return [part.manifest for part in self.parts(plan_key)]
 
+    def jobs(self, plan_key: str | None = None) -> list[Job]:
+        """The jobs (of one plan) whose shards are committed, by name; their ranges may overlap.
+
+        No manifest is read: of a million shards that would take a quarter of an hour, and their names take seconds.
+        """
+        return reader.committed_jobs(self.place, plan_key)
+
     def parts(self, plan_key: str | None = None) -> list[Part]:
         """What counts of which shard, in order; raises as `committed` does."""
         parts = parts_of(reader.read_manifests(reader.committed_shards(self.place, plan_key)))
@@ -206,6 +213,8 @@ class Store:
         rollouts: Sequence[RolloutRecord],
         provenance: Mapping[str, str],
         quarantined: Sequence[Quarantined] = (),
+        *,
+        vetted: bool = False,
     ) -> ShardManifest:
         """Store the rollouts of a job as one shard: wholly or not at all, and once, however many workers try.
 
@@ -215,6 +224,8 @@ class Store:
             rollouts: all of them, in order.
             provenance: what is known of how they were made, such as seconds by stage; not part of the digest.
             quarantined: why rollouts of that status are; likewise no part of it.
+            vetted: whether a driver has seen that no shard holds these rollouts. Otherwise the names of all shards are
+                listed for it, which takes the longer the more there are. Readers count each rollout once in any case.
 
         Returns:
             The manifest; that of the shard which was there already, where another worker was faster.
@@ -233,7 +244,7 @@ class Store:
                     "is of another object or seed than the store's"
                 )
         points = self.setting.collection.camera.points
-        return commit_shard(self.place, job, rollouts, points, provenance, quarantined)
+        return commit_shard(self.place, job, rollouts, points, provenance, quarantined, vetted=vetted)
 
     def only_driver(self) -> AbstractContextManager[None]:
         """Hold the store against other drivers, which would do everything twice; in a bucket they may, without harm.

@@ -12,8 +12,10 @@ from shared.store.digest import rollout_digest
 from shared.store.layout import (
     INTERACTIONS_FILE,
     MANIFEST_FILE,
+    MAX_ROWS,
     OBSERVATIONS_FOLDER,
     ROLLOUTS_FILE,
+    SHARDS_FOLDER,
     FileEntry,
     Quarantined,
     ShardManifest,
@@ -26,7 +28,6 @@ from shared.store.reader import (
     read_manifest,
     read_rollouts,
     shard_folder,
-    shard_folders,
 )
 from shared.store.sealed import seal
 from shared.store.tables import table_bytes
@@ -41,6 +42,8 @@ def commit_shard(
     provenance: Mapping[str, str],
     quarantined: Sequence[Quarantined],
     supersedes: Collection[str] = (),
+    *,
+    vetted: bool = False,
 ) -> ShardManifest:
     """Write a shard and commit it; where another worker was faster, its shard stays and its manifest is returned.
 
@@ -52,6 +55,7 @@ def commit_shard(
         provenance: what else is known of how they were made, such as seconds by stage.
         quarantined: why rollouts of that status are.
         supersedes: shards whose rollouts this one holds too, and that it may overlap.
+        vetted: whether it is known that it overlaps no other, so that this need not be looked for.
 
     Raises:
         StoreError: a rollout breaks the rules of a record, or the job overlaps another shard of its plan.
@@ -62,6 +66,10 @@ def commit_shard(
     check_rollouts(rollouts, job, points, job.shard_id)
     check_quarantined(rollouts, quarantined, job.shard_id)
     files = _encode(rollouts, points)
+
+    def admit() -> None:
+        if not vetted:
+            _refuse_overlap(place, job, supersedes)
 
     def describe(held: Mapping[str, bytes]) -> bytes:
         manifest = _describe(job, rollouts, held, points, provenance, quarantined)
@@ -75,7 +83,7 @@ def commit_shard(
             files=files,
             mark=MANIFEST_FILE,
             describe=describe,
-            admit=lambda: _refuse_overlap(place, job, supersedes),
+            admit=admit,
             lock=job.plan_key,
         )
     )
@@ -128,9 +136,14 @@ def _check_taken_over(shard: Folder, manifest: ShardManifest) -> None:
 
 
 def _refuse_overlap(place: Place, job: Job, supersedes: Collection[str]) -> None:
-    for folder in shard_folders(place, job.plan_key):
-        other = parse_shard_id(folder.name)
-        if other is None or other == job or folder.name in supersedes:
+    # No shard holds more than MAX_ROWS rollouts, so none that begins earlier reaches the job. From 10^8 rollouts on the
+    # order of names is not that of numbers, and an overlap may be left for `verify` to find.
+    first = Job(job.plan_key, max(job.start - MAX_ROWS, 0), job.stop).shard_id
+    for name in place.names_from(SHARDS_FOLDER, first[: first.rindex("-")]):
+        other = parse_shard_id(name)
+        if other is None or other == job or name in supersedes:
             continue
-        if other.start < job.stop and job.start < other.stop and is_committed(folder):
-            raise StoreError(f"{job.shard_id}: overlaps the committed shard {folder.name}; plan only missing rollouts")
+        if other.plan_key != job.plan_key or other.start >= job.stop:
+            return
+        if job.start < other.stop and is_committed(shard_folder(place, name)):
+            raise StoreError(f"{job.shard_id}: overlaps the committed shard {name}; plan only missing rollouts")
