@@ -6,7 +6,7 @@ STAMP := $(VENV)/.stamp
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-slow check format bench clean
+.PHONY: help run test test-slow chaos check format bench clean
 
 help:  ## List the verbs.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/'
@@ -20,12 +20,15 @@ $(STAMP): pyproject.toml constraints.txt
 run: $(STAMP)  ## Collect, train, collect again, evaluate: a small campaign, a few minutes on two cores.
 	$(BIN)/adaafford run --preset smoke --out runs/smoke
 
-test: $(STAMP)  ## The tests, without the slow ones.
-	$(BIN)/python -m pytest -q -m "not slow"
+test: $(STAMP)  ## The tests, without the slow ones and chaos.
+	$(BIN)/python -m pytest -q -m "not slow and not chaos"
 
 test-slow: $(STAMP)  ## The slow tests.
 	@# Pytest ends with 5 where it selects no test, which is no failure of a suite that may be empty.
 	$(BIN)/python -m pytest -q -m slow || test $$? -eq 5
+
+chaos: $(STAMP)  ## Kill campaigns at random moments and disturb every write step, about a quarter of an hour; SEED=N for others.
+	$(if $(SEED),ADAAFFORD_CHAOS_SEED=$(SEED)) $(BIN)/python -m pytest -q -m chaos
 
 check: $(STAMP)  ## Lint, formatting, types, import directions.
 	$(BIN)/ruff check .
