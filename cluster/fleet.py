@@ -21,7 +21,7 @@ from shared.errors import AdaAffordError
 from shared.plan import Job, Plan
 
 if TYPE_CHECKING:
-    from collector.worker import Receipt
+    from collector.receipt import Receipt
 
 WAIT_S = 0.5
 """How often a fleet that has nothing to do asks for orders."""

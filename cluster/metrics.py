@@ -18,7 +18,7 @@ from ray.util.metrics import Counter, Gauge
 from shared.plan import Plan
 
 if TYPE_CHECKING:
-    from collector.worker import Receipt
+    from collector.receipt import Receipt
 
 Cause = Literal["fault", "loss", "growth"]
 """Why a worker was replaced: of a rollout's making, killed from outside, or grown too large."""

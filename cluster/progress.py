@@ -15,7 +15,7 @@ from rich.text import Text
 if TYPE_CHECKING:
     from rich.progress import Task
 
-    from collector.worker import Receipt
+    from collector.receipt import Receipt
 
 LINE_EVERY_S = 5.0
 RECENT_S = 30.0

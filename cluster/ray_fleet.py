@@ -29,7 +29,7 @@ from shared.plan import Job, Plan
 from shared.underway import Underway
 
 if TYPE_CHECKING:
-    from collector.worker import Receipt
+    from collector.receipt import Receipt
 
 START_LIMIT_S = 120.0
 """An actor's process imports an engine and PyTorch, which a busy machine or a cold disk may slow; no job's fault."""
@@ -134,7 +134,7 @@ class RayFleet:
         self._looked = time.monotonic()
         self._seats = Seats(workers)
         self._in_flight = 0
-        self._answered: SimpleQueue[Task] = SimpleQueue()
+        self._answered: SimpleQueue[Seat] = SimpleQueue()
         self._plans, self._policies = _Shelf(), _Shelf()
         self._metrics = FleetMetrics(workers)
 
@@ -150,7 +150,8 @@ class RayFleet:
             while waiting or not orders.ended or self._in_flight:
                 self._hand_out(orders, waiting, blame)
                 for seat in self._wait():
-                    # Answers of one actor are taken in the order of what was asked, in whichever they are announced.
+                    # An actor's answers are taken in the order of what was asked, in whichever they are announced; of
+                    # one that was dismissed some are announced that nobody waits for.
                     while seat.tasks and seat.tasks[0].answer.done():
                         self._take_in(seat, waiting, blame, on_receipt)
                 self._replace_hung(waiting, blame)
@@ -171,11 +172,9 @@ class RayFleet:
         timeout_s = self._poll_s if self._in_flight or self._seats.called else WAIT_S
         for _ in range(max(1, self._answered.qsize())):
             try:
-                task = self._answered.get(timeout=timeout_s)
+                yield self._answered.get(timeout=timeout_s)
             except Empty:
                 return
-            if task in task.seat.tasks:
-                yield task.seat
 
     def _hand_out(self, orders: Orders, waiting: deque[Order], blame: Blame) -> None:
         """Give actors that are up what they want, and call an actor for each order that has to wait.
@@ -213,10 +212,9 @@ class RayFleet:
 
     def _ask(self, seat: Seat, order: Order | None, answer: "Future[Any]") -> None:
         """Take note of what an actor was asked."""
-        task = Task(seat, order, answer)
-        seat.tasks.append(task)
+        seat.tasks.append(Task(order, answer))
         self._seats.file(seat)
-        answer.add_done_callback(lambda _: self._answered.put(task))
+        answer.add_done_callback(lambda _: self._answered.put(seat))
 
     def _take_in(
         self, seat: Seat, waiting: deque[Order], blame: Blame, on_receipt: Callable[["Receipt"], None]

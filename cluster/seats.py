@@ -23,12 +23,10 @@ class Task:
     """What an actor was asked: to arrive, or to execute an order.
 
     Attributes:
-        seat: of the actor.
         order: None if it is to arrive.
         answer: its process's name, or the receipt.
     """
 
-    seat: "Seat"
     order: Order | None
     answer: "Future[Any]"
 

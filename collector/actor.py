@@ -11,7 +11,7 @@ from shared.plan import Job, Plan
 from shared.underway import Underway
 
 if TYPE_CHECKING:
-    from collector.worker import Receipt
+    from collector.receipt import Receipt
 
 
 class WrappedWorker(Protocol):

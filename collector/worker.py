@@ -5,7 +5,6 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -19,6 +18,7 @@ from collector.draws import object_of
 from collector.guard import UnderWay
 from collector.object_cache import ObjectCache
 from collector.proposers import RandomProposer
+from collector.receipt import Receipt
 from collector.rollout import quarantined_rollout, run_rollout
 from shared.adaptation import Adapter
 from shared.plan import Job, Plan
@@ -33,31 +33,6 @@ from shared.vocabulary import Proposer
 NOTHING: Mapping[int, str] = MappingProxyType({})
 CACHED_POLICIES = 2
 """An evaluation may go back and forth between the last policy and the first."""
-
-
-@dataclass(frozen=True, slots=True)
-class Receipt:
-    """What came of a job: counts and times, never data.
-
-    Attributes:
-        shard_id: the committed shard.
-        rollouts: how many it holds.
-        interactions: likewise.
-        successes: likewise.
-        outcomes: interactions by outcome kind.
-        seconds: wall time by stage, and "total".
-        quarantined: rollouts that were not executed, since they had failed again and again.
-        memory_mb: what the worker's process held in the end.
-    """
-
-    shard_id: str
-    rollouts: int
-    interactions: int
-    successes: int
-    outcomes: dict[str, int]
-    seconds: dict[str, float]
-    quarantined: int = 0
-    memory_mb: float = 0.0
 
 
 class Worker:

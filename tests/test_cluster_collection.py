@@ -16,7 +16,7 @@ from cluster.locking import only_driver
 from cluster.progress import LINE_EVERY_S, CollectionProgress
 from cluster.run_folder import RunFolder
 from collector.guard import UnderWay
-from collector.worker import Receipt
+from collector.receipt import Receipt
 from shared.errors import StoreError, UsageError, WorkerError
 from shared.plan import Job, Plan
 from shared.store import Store, verify

@@ -18,7 +18,7 @@ from cluster.in_force import LOOK_S, PlanInForce
 from cluster.orders import Series
 from cluster.status import read_status
 from collector.guard import UnderWay
-from collector.worker import Receipt
+from collector.receipt import Receipt
 from shared.errors import WorkerError
 from shared.plan import Job, Plan, missing_ranges
 from shared.store import Store, verify

@@ -7,7 +7,7 @@ import pytest
 
 from cluster import metrics
 from cluster.metrics import FleetMetrics
-from collector.worker import Receipt
+from collector.receipt import Receipt
 from shared.plan import Plan
 from tests.fabricate import fabricate_setting
 

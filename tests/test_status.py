@@ -17,7 +17,7 @@ from cluster.logs import JsonLines, configure
 from cluster.progress import RECENT_S, CollectionProgress
 from cluster.standing import standing_of
 from cluster.status import SILENT_S, DriverStatus, StatusKeeper, read_status
-from collector.worker import Receipt
+from collector.receipt import Receipt
 from shared.errors import UsageError
 from shared.files import process_name
 from shared.plan import Job, Plan

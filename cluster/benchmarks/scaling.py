@@ -1,0 +1,233 @@
+"""How a fleet's driver scales: its processor time and memory by number of actors, with actors that sleep.
+
+What is measured is fitted by two lines, processor time of the driver for a shard by actors, and listing of a store by
+shards; these say what more actors and more interactions would take.
+"""
+
+import time
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import psutil
+
+from cluster.benchmarks.progress import Advance
+from cluster.benchmarks.sleeping import Dormitories, Sleeper
+from cluster.orders import Series
+from cluster.progress import CollectionProgress
+from cluster.ray_fleet import RayFleet
+from cluster.session import ray_session
+from collector.guard import Limits
+from collector.receipt import Receipt
+from shared.plan import Plan
+from shared.underway import Underway
+
+BEDS = 100
+"""Of a dormitory."""
+PER_SHARD = 4
+LOOK_EVERY = 10
+"""Shards, at the driver's memory."""
+SERVERS = ("gcs_server", "raylet")
+"""Ray's own processes on the driver's machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetPoint:
+    """A fleet that was kept busy with sleep.
+
+    Attributes:
+        kind: "process", an actor a process, or "guest", many of them in one.
+        actors: how many.
+        job_s: what a job sleeps.
+        shards: how many were timed.
+        wall_s: which they took.
+        driver_ms: processor time of the driver, milliseconds a shard, all threads of the process counted.
+        servers_ms: of Ray's own processes on its machine.
+        ideal_share: of the throughput that the actors would have if they never waited.
+        memory_mb: of the driver in the end.
+        growth_bytes: of that, a shard, over the second half.
+    """
+
+    kind: str
+    actors: int
+    job_s: float
+    shards: int
+    wall_s: float
+    driver_ms: float
+    servers_ms: float
+    ideal_share: float
+    memory_mb: float
+    growth_bytes: float
+
+
+class FleetBenchmark:
+    """Fleets of several sizes, one after the other.
+
+    Args:
+        plan: handed out; as large as that of a real store, since it names all objects.
+        guests: numbers of actors that share processes.
+        processes: numbers of actors of a process each.
+        shards_per_s: of each fleet: jobs sleep the longer the more actors there are, as the driver would have it.
+        seconds: of each fleet.
+    """
+
+    def __init__(
+        self, plan: Plan, guests: Sequence[int], processes: Sequence[int], shards_per_s: float, seconds: float
+    ) -> None:
+        self._plan = plan
+        self._sizes = [("guest", size) for size in guests] + [("process", size) for size in processes]
+        self._shards_per_s = shards_per_s
+        self._seconds = seconds
+        self.points: list[FleetPoint] = []
+
+    @property
+    def turns(self) -> int:
+        """How often `run` will call `advance`."""
+        return len(self._sizes)
+
+    def run(self, advance: Advance) -> None:
+        """Measure."""
+        for kind, actors in self._sizes:
+            self.points.append(self._measure(kind, actors))
+            advance()
+
+    def _measure(self, kind: str, actors: int) -> FleetPoint:
+        job_s = actors / self._shards_per_s
+        each = max(2, round(self._seconds / job_s))
+        with ExitStack() as stack:
+            scratch = Path(stack.enter_context(TemporaryDirectory(prefix="adaafford-bench-")))
+            stack.enter_context(ray_session(actors if kind == "process" else 1))
+            call = Dormitories(-(-actors // BEDS), BEDS, job_s) if kind == "guest" else None
+            underway = Underway(scratch / "underway")
+            limits = Limits(rollout_s=max(300.0, 2 * job_s))
+            fleet = RayFleet(partial(Sleeper, job_s), underway, actors, limits, call)
+            stack.callback(fleet.close)
+            self._collect(fleet, 0, 2 * actors)
+            servers = _servers()
+            begun, used, served = time.perf_counter(), time.process_time(), _cpu_s(servers)
+            memory = self._collect(fleet, 2 * actors, actors * each)
+            wall_s, used_s, served_s = (
+                time.perf_counter() - begun,
+                time.process_time() - used,
+                _cpu_s(servers) - served,
+            )
+        half = memory[len(memory) // 2 :]
+        return FleetPoint(
+            kind=kind,
+            actors=actors,
+            job_s=job_s,
+            shards=actors * each,
+            wall_s=wall_s,
+            driver_ms=1e3 * used_s / (actors * each),
+            servers_ms=1e3 * served_s / (actors * each),
+            ideal_share=each * job_s / wall_s,
+            memory_mb=memory[-1] / 2**20,
+            growth_bytes=(half[-1] - half[0]) / max(LOOK_EVERY * (len(half) - 1), 1),
+        )
+
+    def _collect(self, fleet: RayFleet, first: int, shards: int) -> list[int]:
+        """Hand out so many jobs, and take in receipts as a collection does; the driver's memory after every tenth."""
+        progress = CollectionProgress("", 0, PER_SHARD * shards, "")
+        process, memory = psutil.Process(), []
+
+        def take(receipt: Receipt) -> None:
+            progress.tally.add(receipt)
+            if progress.tally.rollouts % (LOOK_EVERY * PER_SHARD) == 0:
+                memory.append(process.memory_info().rss)
+
+        rollouts = (PER_SHARD * first, PER_SHARD * (first + shards))
+        fleet.run(Series(lambda: self._plan, [rollouts], PER_SHARD), take)
+        return memory
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """y = at_zero + slope x."""
+
+    at_zero: float
+    slope: float
+
+    @classmethod
+    def through(cls, points: Iterable[tuple[float, float]]) -> "Line":
+        """The line of least squares; level through a single point."""
+        x, y = np.array(list(points), dtype=np.float64).T
+        if len(set(x.tolist())) < 2:
+            return cls(float(y.mean()), 0.0)
+        slope, at_zero = np.polyfit(x, y, 1)
+        return cls(float(at_zero), float(slope))
+
+    def __call__(self, x: float) -> float:
+        """The line at x."""
+        return self.at_zero + self.slope * x
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """A large collection.
+
+    Attributes:
+        actors: how many.
+        interactions: in all.
+        per_shard: rollouts a shard.
+        job_s: a job takes.
+        shards: in all.
+        shards_per_s: that arrive.
+        driver_load: share of one processor that the driver needs; it keeps up if this is well below 1.
+        start_s: until a driver that goes on with the finished store has listed it, on a disk.
+    """
+
+    actors: int
+    interactions: int
+    per_shard: int
+    job_s: float
+    shards: int
+    shards_per_s: float
+    driver_load: float
+    start_s: float
+
+
+def predict(
+    driver_ms: Line,
+    start_s: Line,
+    actors: int,
+    interactions: int,
+    per_shard: int,
+    interactions_per_rollout: int,
+    interactions_per_s: float,
+) -> Prediction:
+    """What the lines say.
+
+    Args:
+        driver_ms: processor time of the driver, milliseconds a shard, by actors.
+        start_s: listing of a store, by shards.
+        actors: how many.
+        interactions: in all.
+        per_shard: rollouts a shard.
+        interactions_per_rollout: as it says.
+        interactions_per_s: of one actor.
+    """
+    job_s = per_shard * interactions_per_rollout / interactions_per_s
+    shards = -(-interactions // (per_shard * interactions_per_rollout))
+    rate = actors / job_s
+    load = rate * driver_ms(actors) / 1e3
+    return Prediction(actors, interactions, per_shard, job_s, shards, rate, load, start_s(shards))
+
+
+def as_json(points: Sequence[FleetPoint]) -> list[dict[str, Any]]:
+    """What `--json` prints of fleets."""
+    return [asdict(point) for point in points]
+
+
+def _servers() -> list[psutil.Process]:
+    """Ray's own processes, which are this one's children."""
+    return [child for child in psutil.Process().children(recursive=True) if child.name() in SERVERS]
+
+
+def _cpu_s(processes: Sequence[psutil.Process]) -> float:
+    times = [process.cpu_times() for process in processes]
+    return float(sum(each.user + each.system for each in times))
