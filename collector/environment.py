@@ -1,5 +1,7 @@
 """The simulated environment: one object with its hidden dynamics, seen by one camera, acted upon by one primitive."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from collector.articulation import ArticulatedObject
@@ -24,6 +26,9 @@ CLOSED_SHARE = 0.5
 class SapienEnvironment:
     """Implements `shared.vocabulary.Environment` with SAPIEN's physics and a depth camera.
 
+    All tries of a rollout are on one part, for what they are to find out is how this door or that switch moves: of the
+    parts that the first observation shows and the task allows, one is drawn in proportion to its visible points.
+
     Args:
         target: the object.
         task: which parts count, and from which states.
@@ -32,7 +37,7 @@ class SapienEnvironment:
         world_from_camera: [4, 4].
         camera: what the camera keeps.
         fidelity: how finely trials are simulated.
-        rng: draws which of the hit pixels become candidates for the cloud.
+        rng: draws which of the hit pixels become candidates for the cloud, and which part is the target.
         clock: sums wall time by stage ("load", "settle", "observe", "simulate").
     """
 
@@ -51,7 +56,7 @@ class SapienEnvironment:
         self.object = target
         self.task = task
         self.primitive = primitive
-        self.qualifying = qualifying_parts(target, task)
+        self.parts = qualifying_parts(target, task)
         with clock.stage("load"):
             self.scene = Scene(target, dynamics, fidelity, primitive)
         self._camera = camera_for(target, world_from_camera, camera)
@@ -121,9 +126,13 @@ class SapienEnvironment:
 
     def _look(self, positions: Float) -> Observation:
         image = self._camera.capture(positions)
-        seen = observation_from(image, self._camera.world_from_camera, self.qualifying, self._camera_config, self._rng)
+        seen = observation_from(image, self._camera.world_from_camera, self.parts, self._camera_config, self._rng)
         if seen is None:
             raise LookupError(f"no pixel sees object {self.object.ref.id}")
+        if len(self.parts) > 1 and seen.movable.any():
+            part = int(self._rng.choice(seen.part_ids[seen.movable]))
+            self.parts = (part,)
+            seen = replace(seen, movable=seen.part_ids == part)
         return seen
 
     def _settle(self) -> bool:

@@ -127,7 +127,7 @@ class Observation:
     part_ids: NDArray[np.uint8]
     """[N], 0 for the static body, k for the k-th movable part (1-based)."""
     movable: NDArray[np.bool_]
-    """[N], whether the task may act on the point."""
+    """[N], whether the point is on the part that is to be moved; a rollout is about one part."""
     pixels: NDArray[np.uint32]
     """[N], row * image width + column of the ray that hit the point."""
     world_from_camera: Float

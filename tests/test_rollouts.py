@@ -99,6 +99,19 @@ def test_an_object_that_changed_since_is_refused(objects: Path, tmp_path: Path) 
         Worker(tmp_path / "store", objects).run(plan, Job(plan.key, 0, 1))
 
 
+def test_a_rollout_is_about_one_part_and_rollouts_about_all(objects: Path) -> None:
+    plan = plan_for(objects)
+    touched: dict[str, set[int]] = {}
+    for index in range(8):
+        record = rollout(plan, objects, index)
+        parts = {row.target_part for row in record.interactions}
+        assert len(parts) == 1
+        for seen in record.observations:
+            assert set(seen.part_ids[seen.movable].tolist()) == parts
+        touched.setdefault(record.object.id, set()).update(parts)
+    assert max(map(len, touched.values())) > 1
+
+
 def test_restart_order_tries_several_actions_from_one_observed_state(objects: Path) -> None:
     record = rollout(plan_for(objects), objects)
     assert record.status == "ok"
