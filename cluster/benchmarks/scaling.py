@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import psutil
 
+from cluster.benchmarks.listing import StorePoint
 from cluster.benchmarks.progress import Advance
 from cluster.benchmarks.sleeping import Dormitories, Sleeper
 from cluster.orders import Series
@@ -32,6 +33,7 @@ BEDS = 100
 PER_SHARD = 4
 LOOK_EVERY = 10
 """Shards, at the driver's memory."""
+PREDICTED_PER_SHARD = (4, 16, 64, 256)
 SERVERS = ("gcs_server", "raylet")
 """Ray's own processes on the driver's machine."""
 
@@ -142,7 +144,7 @@ class FleetBenchmark:
 
         rollouts = (PER_SHARD * first, PER_SHARD * (first + shards))
         fleet.run(Series(lambda: self._plan, [rollouts], PER_SHARD), take)
-        return memory
+        return [*memory, process.memory_info().rss]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,60 +169,74 @@ class Line:
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
-    """A large collection.
+class Wish:
+    """What is to be predicted.
 
     Attributes:
         actors: how many.
         interactions: in all.
-        per_shard: rollouts a shard.
-        job_s: a job takes.
-        shards: in all.
-        shards_per_s: that arrive.
-        driver_load: share of one processor that the driver needs; it keeps up if this is well below 1.
-        start_s: until a driver that goes on with the finished store has listed it, on a disk.
+        per_rollout: interactions of a rollout.
+        interactions_per_s: of one actor.
     """
 
     actors: int
     interactions: int
+    per_rollout: int
+    interactions_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """A large collection.
+
+    Attributes:
+        per_shard: rollouts a shard.
+        job_s: a job takes.
+        shards: in all.
+        shards_per_s: that arrive.
+        driver_load: share of one processor that the driver needs; it keeps up while this is well below 1.
+        start_s: until a driver has listed the finished store, on a disk.
+        most_actors: that one processor could serve.
+    """
+
     per_shard: int
     job_s: float
     shards: int
     shards_per_s: float
     driver_load: float
     start_s: float
+    most_actors: int
 
 
-def predict(
-    driver_ms: Line,
-    start_s: Line,
-    actors: int,
-    interactions: int,
-    per_shard: int,
-    interactions_per_rollout: int,
-    interactions_per_s: float,
-) -> Prediction:
+def predict(driver_ms: Line, start_s: Line, wish: Wish, per_shard: int) -> Prediction:
     """What the lines say.
 
     Args:
         driver_ms: processor time of the driver, milliseconds a shard, by actors.
         start_s: listing of a store, by shards.
-        actors: how many.
-        interactions: in all.
+        wish: for what.
         per_shard: rollouts a shard.
-        interactions_per_rollout: as it says.
-        interactions_per_s: of one actor.
     """
-    job_s = per_shard * interactions_per_rollout / interactions_per_s
-    shards = -(-interactions // (per_shard * interactions_per_rollout))
-    rate = actors / job_s
-    load = rate * driver_ms(actors) / 1e3
-    return Prediction(actors, interactions, per_shard, job_s, shards, rate, load, start_s(shards))
+    job_s = per_shard * wish.per_rollout / wish.interactions_per_s
+    shards = -(-wish.interactions // (per_shard * wish.per_rollout))
+    rate, each_s = wish.actors / job_s, driver_ms(wish.actors) / 1e3
+    return Prediction(per_shard, job_s, shards, rate, rate * each_s, start_s(shards), int(job_s / each_s))
 
 
-def as_json(points: Sequence[FleetPoint]) -> list[dict[str, Any]]:
-    """What `--json` prints of fleets."""
-    return [asdict(point) for point in points]
+def predictions(fleets: Sequence[FleetPoint], stores: Sequence[StorePoint], wish: Wish) -> dict[str, Any]:
+    """The lines through what was measured, and what they say of some sizes of shards."""
+    guests = [point for point in fleets if point.kind == "guest"] or fleets
+    # A slope below zero is noise, and would make the large look cheap.
+    driver_ms = Line.through((point.actors, point.driver_ms) for point in guests)
+    if driver_ms.slope < 0:
+        driver_ms = Line(max(point.driver_ms for point in guests), 0.0)
+    start_s = Line.through((point.shards, point.start_s) for point in stores)
+    return {
+        "driver_ms_by_actors": asdict(driver_ms),
+        "start_s_by_shards": asdict(start_s),
+        "predicted_for": asdict(wish),
+        "predictions": [asdict(predict(driver_ms, start_s, wish, per_shard)) for per_shard in PREDICTED_PER_SHARD],
+    }
 
 
 def _servers() -> list[psutil.Process]:

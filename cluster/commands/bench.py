@@ -20,7 +20,7 @@ from shared.vocabulary import Primitive
 if TYPE_CHECKING:
     from shared.plan import Plan
 
-ACTIONS = ("fidelity", "dynamics", "collect", "store", "learner", "adapt")
+ACTIONS = ("fidelity", "dynamics", "collect", "store", "scale", "learner", "adapt")
 
 
 class BenchSettings(ObjectSelection):
@@ -110,6 +110,10 @@ def main(args: list[str]) -> int:
             from cluster.commands.bench_store import store
 
             return store(args[1:])
+        case ["scale"]:
+            from cluster.commands.bench_scale import scale
+
+            return scale(args[1:])
         case ["learner"]:
             from cluster.commands.bench_learner import learner
 
