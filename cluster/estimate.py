@@ -154,6 +154,7 @@ class _Costs:
             weights = Policy(self.task.name, network).modules()
         self.weights_bytes = 4.0 * sum(tensor.numel() for tensor in weights.parameters())
         self.clouds = 0
+        self._rows_a_rollout = config.collection.rollout.interactions
 
     def stages(self) -> Iterator[StageCost]:
         """As `cluster.campaign.Campaign.stages` has them; what costs next to nothing is left out."""
@@ -221,10 +222,14 @@ class _Costs:
 
     def _aap_s(self, first: bool) -> float:
         told = self.config.learner.aap
-        steps = told.steps + (told.oracle_steps if first and told.training == "privileged" else 0)
-        clouds = told.batch_rollouts * self._clouds_a_rollout(0)
-        rows = told.batch_rollouts * told.rows_per_rollout * (told.context + 1)
-        return self._steps_s(steps, clouds, rows) + self._affordance_s(told.affordance)
+        each, a_rollout = self._clouds_a_rollout(0), min(told.rows_per_rollout, self._rows_a_rollout)
+        privileged = told.training == "privileged"
+        rows = told.batch_rollouts * a_rollout * (told.context + 1)
+        seconds = self._steps_s(told.steps, 0 if privileged else told.batch_rollouts * each, rows)
+        if privileged and first:
+            rollouts = told.oracle_batch_rollouts
+            seconds += self._steps_s(told.oracle_steps, rollouts * each, rollouts * a_rollout)
+        return seconds + self._affordance_s(told.affordance)
 
     def _aip_s(self) -> float:
         told = self.config.learner.aip

@@ -16,8 +16,10 @@ class TrainingConfig(StrictModel):
     """End after this much training time, whatever `steps` says; such a run cannot be repeated bit for bit."""
     learning_rate: float = Field(1e-3, gt=0)
     """As published: 1e-3 for the prior, 1e-4 for the alternation, on a hundred times more steps."""
+    schedule: Literal["cosine", "published"] = "cosine"
+    """Of the learning rate. "cosine": it grows over the first tenth of the training and falls to nothing along half a
+    cosine, as few steps want it; "published": `decay` every `decay_steps`."""
     decay: float = Field(0.9, gt=0, le=1)
-    """Factor of the learning rate every `decay_steps`, as published."""
     decay_steps: int = Field(5_000, ge=1)
     weight_decay: float = Field(1e-5, ge=0)
     validate_every: int = Field(50, ge=1)
@@ -67,16 +69,18 @@ class AapConfig(TrainingConfig):
     """Adaptive Affordance Prediction."""
 
     training: Literal["paper", "privileged"] = "privileged"
-    """"paper": end to end. "privileged": first an oracle critic that is told the hidden facts; AAP starts from it and
-    learns to infer them, and to imitate its scores. An AAP that is already trained is fine-tuned end to end either way.
+    """"paper": end to end. "privileged": first an oracle critic that is told the hidden facts; AAP starts from it,
+    keeps its point encoder, and learns to infer the facts and to imitate its scores. An AAP that is already trained is
+    fine-tuned without an oracle.
     """
-    steps: int = Field(120, ge=1)
-    learning_rate: float = Field(3e-3, gt=0)
-    batch_rollouts: int = Field(12, ge=1)
-    """Rows of one rollout share what is hidden, so that few rollouts a step teach little of it."""
+    steps: int = Field(600, ge=1)
+    learning_rate: float = Field(2e-3, gt=0)
+    batch_rollouts: int = Field(64, ge=1)
+    """Rows of one rollout share what is hidden, so that few rollouts a step teach little of it. Training the paper's
+    way encodes their clouds, so that twelve are as much as two cores care for."""
     rows_per_rollout: int = Field(32, ge=2)
     """At the most, drawn anew each time."""
-    validate_every: int = Field(25, ge=1)
+    validate_every: int = Field(50, ge=1)
     patience: int = Field(8, ge=1)
     context: int = Field(8, ge=1)
     """The longest context; every shorter one, and none, is trained in the same pass."""
@@ -92,9 +96,12 @@ class AapConfig(TrainingConfig):
     """Weight of the loss that draws scores to the oracle's, which are surer than single successes; privileged training
     only."""
     inherited_rate: float = Field(0.2, ge=0, le=1)
-    """Factor of the learning rate for what comes from the oracle; privileged training only."""
-    oracle_steps: int = Field(120, ge=1)
+    """Factor of the learning rate for what comes from the oracle, and for an AAP that is fine-tuned; privileged
+    training only."""
+    oracle_steps: int = Field(300, ge=1)
     """Steps of the oracle critic; privileged training only."""
+    oracle_batch_rollouts: int = Field(12, ge=1)
+    oracle_learning_rate: float = Field(3e-3, gt=0)
 
 
 class AipConfig(TrainingConfig):

@@ -163,7 +163,9 @@ class Recipe:
             critic = OracleCritic(copy.deepcopy(self.policy.aap))
         critic.to(self.runner.hardware.device)
         config = self.config.aap
-        settings = config.model_copy(update={"steps": config.oracle_steps})
+        settings = config.model_copy(
+            update={"steps": config.oracle_steps, "learning_rate": config.oracle_learning_rate}
+        )
         self.runner.train(OracleStage(critic, self.dataset, self.parts, config), settings, "oracle", ORACLE_FOLDER)
         if sharing.rank() == 0:
             weights = save({name: tensor.contiguous() for name, tensor in critic.state_dict().items()})

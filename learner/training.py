@@ -28,6 +28,8 @@ from shared.errors import UsageError
 from shared.seeds import generator
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
+WARMING = 0.1
+"""Share of the steps in which the learning rate grows, where it follows a cosine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,9 +180,9 @@ class _Loop:
     def _step(self) -> None:
         started = time.monotonic()
         step = self.cursor.step
-        decayed = self.config.learning_rate * self.config.decay ** (step // self.config.decay_steps)
+        rate = self.config.learning_rate * rate_factor(self.config, step)
         for group, options in zip(self.groups, self.optimiser.param_groups, strict=True):
-            options["lr"] = decayed * group.rate
+            options["lr"] = rate * group.rate
         self.stage.module.train()
         with self.hardware.products():
             losses, interactions = self._forward(generator(self.seed, f"learner.{self.stage.name}", step))
@@ -257,6 +259,16 @@ class _Loop:
         temporary = path.with_suffix(".tmp")
         temporary.write_text(text, encoding="utf-8")
         temporary.replace(path)
+
+
+def rate_factor(config: TrainingConfig, step: int) -> float:
+    """What the learning rate is multiplied with at a step, from 0."""
+    if config.schedule == "published":
+        return config.decay ** (step // config.decay_steps)
+    done = (step + 0.5) / config.steps
+    if done < WARMING:
+        return done / WARMING
+    return 0.5 * (1.0 + math.cos(math.pi * (done - WARMING) / (1.0 - WARMING)))
 
 
 def without_nan(values: Mapping[str, Any]) -> dict[str, Any]:

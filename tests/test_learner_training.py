@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from cluster.cli import run
-from learner.aap import AapStage, OracleStage, predict
+from learner.aap import AapStage, OracleStage, SeenRows, predict
 from learner.affordance import AapAnswer, AffordanceStage, AipAnswer, Answer, PriorAnswer
 from learner.aip import AipStage
 from learner.checkpoint import Cursor
@@ -27,7 +27,7 @@ from learner.oracle import OracleCritic
 from learner.prior import PriorStage
 from learner.sampling import Batch, ProposalPool, order_rows
 from learner.stages import DONE_FILE, StageJob, read_policy_folder, run_stage
-from learner.training import Stage, StepResult, train
+from learner.training import Stage, StepResult, rate_factor, train
 from shared.errors import UsageError
 from shared.policy import WEIGHTS_FILE, Policy
 from shared.records import InteractionRecord, RolloutRecord
@@ -221,7 +221,7 @@ def test_gains_are_differences_of_the_loss_on_the_same_rows(coin_dataset: Datase
     ordered = order_rows(coin_dataset, [0, 1], 12, np.random.default_rng(0))
     found = stage.gains(ordered)
     with torch.no_grad():
-        logits = predict(policy.aap, Batch.of(coin_dataset, ordered), 3).logits
+        logits = predict(policy.aap, SeenRows.of(Batch.of(coin_dataset, ordered), policy.aap.encoder), 3).logits
     success = coin_dataset.rows.success[ordered.rows][:, None].expand_as(logits)
     losses = nn.functional.binary_cross_entropy_with_logits(logits, success, reduction="none")[..., 3:].mean(-1)
     torch.testing.assert_close(found.gains, losses[:, :-1] - losses[:, 1:], rtol=1e-3, atol=1e-5)
@@ -236,16 +236,19 @@ def reached(stage: Stage, whole: nn.Module) -> set[str]:
     return {name.split(".")[1] for name, p in whole.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
 
 
-def test_gradients_reach_their_own_module_and_no_other(dataset: Dataset) -> None:
+@pytest.mark.parametrize("training", ["paper", "privileged"])
+def test_gradients_reach_their_own_module_and_no_other(dataset: Dataset, training: str) -> None:
     policy, pool = fresh(dataset)
     whole = nn.ModuleDict({"aap": policy.aap, "prior": policy.prior, "aip": policy.aip})
     stages = {
         "prior": PriorStage(policy.prior, dataset, EVERYTHING, PriorConfig(proposals=5)),
-        "aap": AapStage(policy.aap, dataset, EVERYTHING, AapConfig()),
+        "aap": AapStage(policy.aap, dataset, EVERYTHING, AapConfig(training=training)),
     }
+    kept = {"affordance_head", "place_encoder"} | ({"encoder"} if training == "privileged" else set())
     for name, stage in stages.items():
         policy.prior.requires_grad_(name == "prior")
-        learnt = {child for child, _ in getattr(policy, name).named_children()} - {"affordance_head", "place_encoder"}
+        of_this = kept if name == "aap" else kept - {"encoder"}
+        learnt = {child for child, _ in getattr(policy, name).named_children()} - of_this
         assert reached(stage, whole) == learnt | ({"empty_latent"} if name == "aap" else set())
         others = [p for key, p in whole.named_parameters() if not key.startswith(name)]
         assert all(p.grad is None for p in others)
@@ -259,6 +262,18 @@ def test_gradients_reach_their_own_module_and_no_other(dataset: Dataset) -> None
     descend(aip, 3)
     assert all(torch.equal(tensor, before[name]) for name, tensor in policy.aap.state_dict().items())
     assert all(p.grad is None for p in policy.aap.parameters())
+
+
+def test_the_learning_rate_grows_and_falls_to_nothing_or_decays_as_published() -> None:
+    cosine = [rate_factor(TrainingConfig(steps=200), step) for step in range(200)]
+    top = int(np.argmax(cosine))
+    assert 19 <= top <= 20
+    assert cosine[:top] == sorted(cosine[:top])
+    assert cosine[top:] == sorted(cosine[top:], reverse=True)
+    assert max(cosine) == pytest.approx(1, abs=1e-3)
+    assert cosine[-1] < 1e-3
+    published = TrainingConfig(schedule="published")
+    assert [rate_factor(published, step) for step in (0, 4999, 5000, 10_000)] == pytest.approx([1, 1, 0.9, 0.81])
 
 
 class KilledError(Exception):
