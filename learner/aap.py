@@ -16,7 +16,7 @@ from learner.configuration import AapConfig
 from learner.data import Dataset, Split
 from learner.losses import action_scoring_loss, distillation_loss
 from learner.metrics import discrimination, discrimination_in_chunks
-from learner.oracle import OracleCritic
+from learner.oracle import OracleCritic, Teacher
 from learner.sampling import Batch, OrderedRows, draw_numbers, frozen_features, order_rows, spread
 from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
@@ -59,29 +59,6 @@ class SeenRows:
 
 
 @dataclass(frozen=True, slots=True)
-class Teacher:
-    """What an oracle says of all rows, which does not change while AAP learns from it.
-
-    Attributes:
-        latents: z = h(hidden facts), [I, latent_width].
-        scores: s_u, [I].
-    """
-
-    latents: Tensor
-    scores: Tensor
-
-    @classmethod
-    @torch.no_grad()
-    def of(cls, oracle: OracleCritic, features: Tensor, dataset: Dataset) -> "Teacher":
-        """Ask the oracle; `features`, [I, feature_width], are those of its encoder."""
-        oracle.eval().requires_grad_(False)
-        rows = dataset.rows
-        latents = oracle.oracle(rows.facts)
-        scores = torch.sigmoid(oracle.aap.action_logits(features, rows.xyz, rows.frame, latents))
-        return cls(latents, scores)
-
-
-@dataclass(frozen=True, slots=True)
 class Prediction:
     """What AAP makes of ordered rows after every prefix of their context.
 
@@ -114,8 +91,20 @@ class AapStage:
         dataset: Dataset,
         parts: Split,
         config: AapConfig,
-        oracle: OracleCritic | None = None,
+        teacher: Teacher | None = None,
+        *,
+        trained: bool = False,
     ) -> None:
+        """Prepare a training.
+
+        Args:
+            aap: what is trained.
+            dataset: the interactions.
+            parts: which to learn from, and which to judge by.
+            config: how.
+            teacher: what an oracle says of the rows; privileged training only.
+            trained: whether `aap` is fine-tuned.
+        """
         self.module: nn.Module = aap
         self.aap = aap
         self.dataset = dataset
@@ -123,11 +112,10 @@ class AapStage:
         self.config = config
         rows = dataset.rows
         self._features = self._teacher = None
+        self._trained = trained
         if config.training == "privileged":
             self._features = frozen_features(aap.encoder, dataset.clouds, rows.cloud, rows.point)
-        if oracle is not None:
-            assert self._features is not None, "only privileged training has an oracle"
-            self._teacher = Teacher.of(oracle, self._features, dataset)
+            self._teacher = teacher
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """All of AAP but D, and its encoder where that stays as it is; what was trained before moves more slowly."""
@@ -136,7 +124,7 @@ class AapStage:
         trained = [p for p in self.aap.parameters() if id(p) not in fixed]
         if self._features is None:
             return [ParameterGroup(tuple(trained))]
-        if self._teacher is None:
+        if self._trained:
             return [ParameterGroup(tuple(trained), self.config.inherited_rate)]
         inherited = {id(p) for part in (self.aap.action_encoder, self.aap.critic_head) for p in part.parameters()}
         old = tuple(p for p in trained if id(p) in inherited)

@@ -14,6 +14,7 @@ from learner.data import Dataset, Split
 from learner.frozen import FrozenAap
 from learner.losses import action_scoring_losses, information_gains, information_loss, mean_information_loss
 from learner.metrics import correlation
+from learner.oracle import Teacher
 from learner.sampling import OrderedRows, draw_numbers, order_rows, spread
 from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
@@ -46,12 +47,21 @@ class AipStage:
     """Trains all of `Aip` but D (AdaAfford, AIP Action Scoring Loss); AAP stays as it is.
 
     The drop of the AAP loss is measured on rows of the same rollout that are no context at all, the same for every
-    prefix, so that two losses differ by one try alone.
+    prefix, so that two losses differ by one try alone. Privileged: with a teacher, the loss is against what the oracle
+    expects instead of single successes, which are ten coins a rollout that would drown the drop.
     """
 
     name = "aip"
 
-    def __init__(self, aip: Aip, dataset: Dataset, parts: Split, config: AipConfig, frozen: FrozenAap) -> None:
+    def __init__(
+        self,
+        aip: Aip,
+        dataset: Dataset,
+        parts: Split,
+        config: AipConfig,
+        frozen: FrozenAap,
+        teacher: Teacher | None = None,
+    ) -> None:
         self.module: nn.Module = aip
         self.aip = aip
         self.dataset = dataset
@@ -59,6 +69,7 @@ class AipStage:
         self.config = config
         self.frozen = frozen
         self._inherits = config.training == "inherited"
+        self._answers = teacher.scores if self._inherits and teacher is not None else dataset.rows.success
         if self._inherits:
             aip.encoder.load_state_dict(frozen.aap.encoder.state_dict())
 
@@ -114,7 +125,7 @@ class AipStage:
         xyz, frames = rows.xyz[ordered.rows][:, None], rows.frame[ordered.rows][:, None]
         logits = frozen.aap.action_logits(features, xyz, frames, latents[:, :, None])
         held_out = ordered.asked(context)[:, -1]
-        losses = action_scoring_losses(logits, rows.success[ordered.rows][:, None])
+        losses = action_scoring_losses(logits, self._answers[ordered.rows][:, None])
         counts = held_out[:, None].to(losses.dtype)
         per_prefix = (losses * counts).sum(dim=-1) / counts.sum(dim=-1).clamp_min(1.0)
         own = torch.arange(context)

@@ -166,11 +166,12 @@ def trained_in(out: Path) -> Trained:
             best = int(json.loads(read_bounded(record, MAX_DONE_BYTES))["best"])
         except (ValueError, KeyError, TypeError, RecursionError):
             raise StoreError(f"{record}: damaged; the same training again writes it anew") from None
-        policy, oracle = out / f"aip-{best}", out / "aap-1" / ORACLE_FILE
+        policy = out / f"aip-{best}"
     else:
-        policy, oracle = out, out / ORACLE_FILE
+        policy = out
     if not (policy / DONE_FILE).is_file():
         raise UsageError(f"{out}: holds no finished training; name the --out of `adaafford train alternate` or aap")
+    oracle = policy / ORACLE_FILE
     return Trained(policy, oracle if oracle.is_file() else None)
 
 

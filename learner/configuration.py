@@ -109,7 +109,8 @@ class AipConfig(TrainingConfig):
 
     training: Literal["paper", "inherited"] = "inherited"
     """"paper": a point encoder of its own, and L1, which finds the median gain of a try. "inherited": AAP's encoder as
-    it is, so that a step may see ten times the rollouts, and squares, which find the mean gain."""
+    it is, so that a step may see ten times the rollouts, squares, which find the mean gain, and, where an oracle taught
+    AAP, gains by what it expects instead of by single successes."""
     steps: int = Field(200, ge=1)
     validate_every: int = Field(25, ge=1)
     patience: int = Field(8, ge=1)

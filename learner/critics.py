@@ -10,7 +10,7 @@ from torch import Tensor
 
 from learner.data import Dataset
 from learner.frozen import FrozenPrior
-from learner.oracle import OracleCritic
+from learner.oracle import OracleCritic, Teacher
 from learner.sampling import frozen_features
 from learner.where2act_adaptation import corrected_scores
 from shared.methods import CriticName
@@ -99,15 +99,8 @@ class OracleScores:
     """The oracle critic, which is told the hidden facts and needs no tries."""
 
     def __init__(self, oracle: OracleCritic, dataset: Dataset) -> None:
-        self._oracle, self._rows = oracle, dataset.rows
-        self._features = frozen_features(oracle.aap.encoder, dataset.clouds, dataset.rows.cloud, dataset.rows.point)
+        self._teacher = Teacher.of(oracle, dataset)
 
-    @torch.no_grad()
     def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
         """s_u with z = h(hidden facts)."""
-        latents = self._oracle.oracle(self._rows.facts[asked])
-        return torch.sigmoid(
-            self._oracle.aap.action_logits(
-                self._features[asked], self._rows.xyz[asked], self._rows.frame[asked], latents
-            )
-        )
+        return self._teacher.scores[asked]

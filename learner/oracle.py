@@ -1,12 +1,17 @@
-"""The oracle critic: AAP's critic with z told outright; the upper bound of adaptation, and a teacher."""
+"""The oracle critic: AAP's critic with z told outright; the upper bound of adaptation, and a teacher.
 
+Shapes: I interactions, B rollouts, n rows of each.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from learner.data import Dataset
 from learner.facts import FACTS_WIDTH
-from learner.sampling import Batch
+from learner.sampling import Batch, frozen_features
 from shared.files import read_bounded
 from shared.networks.aap import Aap, OracleEncoder
 from shared.networks.configuration import NetworkConfig
@@ -33,6 +38,30 @@ class OracleCritic(nn.Module):
         """Logits of the rows' scores, [B, n]."""
         features = batch.features(self.aap.encoder)
         return self.aap.action_logits(features, batch.xyz, batch.frame, self.oracle(batch.facts))
+
+
+@dataclass(frozen=True, slots=True)
+class Teacher:
+    """What an oracle says of all rows of a data set, which does not change while others learn from it.
+
+    Attributes:
+        latents: z = h(hidden facts), [I, latent_width].
+        scores: s_u, [I].
+    """
+
+    latents: Tensor
+    scores: Tensor
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, oracle: OracleCritic, dataset: Dataset) -> "Teacher":
+        """Ask the oracle about everything."""
+        oracle.eval().requires_grad_(False)
+        rows = dataset.rows
+        features = frozen_features(oracle.aap.encoder, dataset.clouds, rows.cloud, rows.point)
+        latents = oracle.oracle(rows.facts)
+        scores = torch.sigmoid(oracle.aap.action_logits(features, rows.xyz, rows.frame, latents))
+        return cls(latents, scores)
 
 
 def read_oracle(path: Path, config: NetworkConfig) -> OracleCritic:

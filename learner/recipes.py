@@ -15,7 +15,7 @@ from learner.configuration import AffordanceConfig, LearnerConfig, TrainingConfi
 from learner.data import Dataset, Split
 from learner.frozen import FrozenAap, FrozenPrior
 from learner.hardware import Hardware
-from learner.oracle import OracleCritic
+from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
 from learner.sampling import ProposalPool
 from learner.training import Stage, TrainingResult, train
@@ -59,13 +59,23 @@ class Runner:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """What the stages have in common: a policy of which one module is trained, from what, and how."""
+    """What the stages have in common: a policy of which one module is trained, from what, and how.
+
+    Attributes:
+        config: the settings.
+        policy: the modules.
+        dataset: the interactions.
+        parts: which to learn from, and which to judge by.
+        runner: trains one network.
+        oracle: what privileged training of AAP left, to teach further stages; None where there is none.
+    """
 
     config: LearnerConfig
     policy: Policy
     dataset: Dataset
     parts: Split
     runner: Runner
+    oracle: OracleCritic | None = None
 
     def train(self, stage: ModuleName) -> TrainingResult:
         """Train one module of the policy; the others stay as they are."""
@@ -94,10 +104,12 @@ class Recipe:
 
     def _aap(self) -> TrainingResult:
         aap, config, pool = self.policy.aap.requires_grad_(True), self.config.aap, self._pool("aap")
-        # An AAP that has been trained has a z of its own, which a new oracle would only disturb.
-        privileged = config.training == "privileged" and "aap" not in self.policy.trained
-        oracle = self._oracle() if privileged else None
-        result = self.runner.train(AapStage(aap, self.dataset, self.parts, config, oracle), config, "aap")
+        # An AAP that has been trained has a z of its own, which a new oracle would only disturb; the old one may teach.
+        trained, oracle = "aap" in self.policy.trained, self.oracle
+        if config.training == "privileged" and not trained:
+            oracle = self._oracle()
+        stage = AapStage(aap, self.dataset, self.parts, config, self._teacher(oracle), trained=trained)
+        result = self.runner.train(stage, config, "aap")
         frozen = FrozenAap.of(aap, self.dataset, pool)
         affordance = AffordanceStage(
             "aap-affordance",
@@ -113,7 +125,8 @@ class Recipe:
     def _aip(self) -> TrainingResult:
         aip, config, pool = self.policy.aip.requires_grad_(True), self.config.aip, self._pool("aip")
         frozen = FrozenAap.of(self.policy.aap, self.dataset, pool)
-        result = self.runner.train(AipStage(aip, self.dataset, self.parts, config, frozen), config, "aip")
+        stage = AipStage(aip, self.dataset, self.parts, config, frozen, self._teacher(self.oracle))
+        result = self.runner.train(stage, config, "aip")
         aip.eval().requires_grad_(False)
         features = pool.features_under(aip.encoder, self.dataset.clouds)
         answer = AipAnswer(aip, features, frozen, config.top)
@@ -154,6 +167,10 @@ class Recipe:
 
     def _pool(self, stage: ModuleName) -> ProposalPool:
         return ProposalPool.of(self.dataset, self.policy.prior, generator(self.config.seed, f"learner.{stage}.pool"))
+
+    def _teacher(self, oracle: OracleCritic | None) -> Teacher | None:
+        """What the oracle says of all rows; nobody teaches where the paper's way is asked for."""
+        return None if oracle is None else Teacher.of(oracle, self.dataset)
 
     def _oracle(self) -> OracleCritic:
         """Train the oracle critic, save it, and start AAP from it."""

@@ -5,7 +5,8 @@ OUT/ of a stage
     metrics.jsonl          one line a validation
     checkpoint.safetensors until it is done
     affordance/            the last two of the affordance network, where the stage has one
-    oracle/                privileged AAP only: the same of the oracle critic, whose weights are in oracle.safetensors
+    oracle/                privileged AAP only: the same of the oracle critic
+    oracle.safetensors     its weights; they go along to the stages that start from this one, and teach them
     tensorboard/           the metrics again, for TensorBoard, where it is installed
     weights.safetensors    the policy, all its modules
     policy.json
@@ -24,7 +25,8 @@ from learner.configuration import LearnerConfig
 from learner.data import Dataset, Split, load_dataset, split, without_later
 from learner.hardware import Hardware
 from learner.names import METRICS_FILE
-from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FOLDER, Recipe, Runner
+from learner.oracle import read_oracle
+from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FILE, ORACLE_FOLDER, Recipe, Runner
 from learner.training import CHECKPOINT_FILE, TrainingResult, without_nan
 from shared.errors import StoreError, UsageError
 from shared.files import read_bounded, write_atomically
@@ -95,7 +97,8 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
     if job.snapshot is not None:
         store = store.as_of(job.snapshot)
     policy = _initial_policy(job, store, config)
-    fingerprint = _fingerprint(job, config, store, policy)
+    oracle = _oracle_of(job)
+    fingerprint = _fingerprint(job, config, store, policy, oracle)
     done = (job.out / DONE_FILE).exists()
     # Nobody may make the folder of a finished stage before everybody has looked.
     sharing.wait_for_all()
@@ -122,10 +125,13 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
     policy.modules().to(hardware.device)
     with hardware.home():
         runner = Runner(job.out, config.seed, fingerprint, hardware)
-        result = Recipe(config, policy, dataset.on(hardware.device), parts, runner).train(job.stage)
+        told = None if oracle is None else read_oracle(oracle, policy.config).to(hardware.device)
+        result = Recipe(config, policy, dataset.on(hardware.device), parts, runner, told).train(job.stage)
     policy.modules().to("cpu")
     policy.with_trained(job.stage)
     if sharing.rank() == 0:
+        if oracle is not None:
+            write_atomically(job.out / ORACLE_FILE, read_bounded(oracle, MAX_WEIGHTS_BYTES))
         _finish(job, policy, result, fingerprint, _seen(job, store, dataset, parts))
     sharing.wait_for_all()
     _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
@@ -200,7 +206,13 @@ def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Polic
     return policy
 
 
-def _fingerprint(job: StageJob, config: LearnerConfig, store: Store, policy: Policy) -> str:
+def _oracle_of(job: StageJob) -> Path | None:
+    """The oracle that the stage before has or was taught by, which teaches this one too."""
+    path = None if job.init is None else job.init / ORACLE_FILE
+    return path if path is not None and job.stage in ("aap", "aip") and path.is_file() else None
+
+
+def _fingerprint(job: StageJob, config: LearnerConfig, store: Store, policy: Policy, oracle: Path | None) -> str:
     """SHA-256 of all that the stage's result depends on."""
     told = {
         "stage": job.stage,
@@ -213,6 +225,8 @@ def _fingerprint(job: StageJob, config: LearnerConfig, store: Store, policy: Pol
     digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
     for _, data in sorted(policy.to_files().items()):
         digest.update(data)
+    if oracle is not None:
+        digest.update(read_bounded(oracle, MAX_WEIGHTS_BYTES))
     return digest.hexdigest()
 
 

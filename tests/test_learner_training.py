@@ -23,7 +23,7 @@ from learner.data import Dataset, Split, load_dataset
 from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
 from learner.frozen import FrozenAap
 from learner.names import METRICS_FILE
-from learner.oracle import OracleCritic
+from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
 from learner.sampling import Batch, ProposalPool, order_rows
 from learner.stages import DONE_FILE, StageJob, read_policy_folder, run_stage
@@ -108,7 +108,7 @@ def test_the_oracle_knows_and_aap_learns_from_it(coin_dataset: Dataset) -> None:
     descend(oracle_stage, 60)
     assert oracle_stage.validate()["f_score"] > 0.95
     student, _ = fresh(coin_dataset, 1)
-    stage = AapStage(student.aap, coin_dataset, EVERYTHING, config, critic)
+    stage = AapStage(student.aap, coin_dataset, EVERYTHING, config, Teacher.of(critic, coin_dataset))
     before, after = descend(stage, 40)
     assert after["distillation"] < 0.5 * before["distillation"]
 

@@ -18,20 +18,21 @@ from torch import Tensor
 
 from cluster.benchmarks.progress import Advance
 from cluster.benchmarks.straightforward import POINTS, PublishedStep
-from learner.aap import AapStage
+from learner.aap import AapStage, OracleStage
 from learner.aip import AipStage
 from learner.configuration import LearnerConfig, TrainingConfig
 from learner.data import Dataset, Split, load_dataset, split
 from learner.frozen import FrozenAap
-from learner.oracle import OracleCritic
+from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
-from learner.sampling import ProposalPool
 from learner.training import Stage, train
 from shared.policy import Policy
 from shared.seeds import generator
 from shared.store import Store
 
 PARTS = ("read", "sample", "encode", "heads", "optimiser")
+NETWORKS = ("prior", "aap", "oracle", "aap-from-oracle", "aip")
+"""What is trained: AAP end to end, and by privileged training in two steps."""
 NEVER = 10**9
 """Steps between two validations, or seconds between two checkpoints, that a benchmark does not reach."""
 
@@ -63,7 +64,7 @@ class LearningBenchmark:
     @property
     def turns(self) -> int:
         """How often `run` will call `advance`."""
-        return 4 * self.repeats + 1
+        return (len(NETWORKS) + 1) * self.repeats + 1
 
     def run(self, advance: Advance) -> None:
         """Measure; `advance` is called after each network's turn and each of the port's."""
@@ -73,13 +74,13 @@ class LearningBenchmark:
         self._interactions, self._points = len(dataset.rows), dataset.clouds.points.shape[1]
         stages = stages_of(dataset, split(dataset, None, None), self.config)
         port = Port(dataset, self.port_interactions)
-        for stage, settings in stages:
+        for _, stage, settings in stages:
             self._take(stage, settings, read_s, [], {part: [] for part in PARTS})  # Warms up.
         advance()
         for _ in range(self.repeats):
-            for stage, settings in stages:
-                parts = self.parts.setdefault(stage.name, {part: [] for part in PARTS})
-                self._take(stage, settings, read_s, self.rates.setdefault(stage.name, []), parts)
+            for name, stage, settings in stages:
+                parts = self.parts.setdefault(name, {part: [] for part in PARTS})
+                self._take(stage, settings, read_s, self.rates.setdefault(name, []), parts)
                 advance()
             self.rates.setdefault("port", []).append(port.rate())
             advance()
@@ -92,6 +93,8 @@ class LearningBenchmark:
             "aap_interactions_per_second": rates["aap"],
             "times_straightforward_port": rates["aap"] / rates["port"],
             "prior_interactions_per_second": rates["prior"],
+            "oracle_interactions_per_second": rates["oracle"],
+            "aap_from_oracle_interactions_per_second": rates["aap-from-oracle"],
             "aip_interactions_per_second": rates["aip"],
             "straightforward_port_interactions_per_second": rates["port"],
             "step_seconds": seconds,
@@ -123,25 +126,32 @@ class LearningBenchmark:
         parts["read"].append(read_s / settings.steps)
 
 
-def stages_of(dataset: Dataset, parts: Split, config: LearnerConfig) -> list[tuple[Stage, TrainingConfig]]:
-    """The critics of the prior, AAP (from an oracle where so configured) and AIP, with random weights."""
-    policy = Policy.untrained(dataset.task, config.network, config.seed)
-    pool = ProposalPool.of(dataset, policy.prior, generator(config.seed, "bench.pool"))
+def stages_of(dataset: Dataset, parts: Split, config: LearnerConfig) -> list[tuple[str, Stage, TrainingConfig]]:
+    """The critics that are trained, with random weights, named as in `NETWORKS`.
+
+    "aap" is trained end to end, clouds encoded in the step, as the port's is, whatever the configuration says.
+    """
+    policy, other = (Policy.untrained(dataset.task, config.network, config.seed) for _ in range(2))
+    frozen = FrozenAap.of(Policy.untrained(dataset.task, config.network, config.seed).aap, dataset)
     oracle = OracleCritic(Policy.untrained(dataset.task, config.network, config.seed).aap)
-    teacher = oracle if config.aap.training == "privileged" else None
-    frozen = FrozenAap.of(Policy.untrained(dataset.task, config.network, config.seed).aap, dataset, pool)
-    return [
+    teacher = Teacher.of(OracleCritic(Policy.untrained(dataset.task, config.network, config.seed).aap), dataset)
+    paper = config.aap.model_copy(update={"training": "paper", "batch_rollouts": config.aap.oracle_batch_rollouts})
+    told = config.aap.model_copy(update={"training": "privileged"})
+    stages: list[tuple[Stage, TrainingConfig]] = [
         (PriorStage(policy.prior, dataset, parts, config.prior), config.prior),
-        (AapStage(policy.aap, dataset, parts, config.aap, teacher), config.aap),
+        (AapStage(policy.aap, dataset, parts, paper), paper),
+        (OracleStage(oracle, dataset, parts, told), told),
+        (AapStage(other.aap, dataset, parts, told, teacher), told),
         (AipStage(policy.aip, dataset, parts, config.aip, frozen), config.aip),
     ]
+    return [(name, *stage) for name, stage in zip(NETWORKS, stages, strict=True)]
 
 
 class StepApart:
     """Training steps of a stage with a clock between their parts.
 
-    Sampling ends where the stage first asks its encoder or, where it has inherited one, for gains. Features are handed
-    on as new leaves: the first backward pass ends at them, the second goes on through the encoder.
+    Sampling ends where the stage first asks its encoder or, where it has inherited one, for gains or codes. Features are
+    handed on as new leaves: the first backward pass ends at them, the second goes on through the encoder.
     """
 
     def __init__(self, stage: Stage) -> None:
@@ -173,14 +183,14 @@ class StepApart:
         self.seconds["optimiser"] += time.perf_counter() - encoded
 
     def _watched(self) -> "_Patched":
-        oracle = getattr(self.stage, "oracle", None)
-        encoders = [self.stage.module.encoder, *([] if oracle is None else [oracle.aap.encoder])]
-        patches: list[tuple[Any, str, Callable[..., Any]]] = []
-        for encoder in encoders:
-            patches.append((encoder, "forward", self._timed(encoder.forward)))
-            patches.append((encoder, "at", self._cut(self._timed(encoder.at))))
-        if hasattr(self.stage, "gains"):
-            patches.append((self.stage, "gains", self._noted(self.stage.gains)))
+        network: Any = getattr(self.stage.module, "aap", self.stage.module)
+        patches: list[tuple[Any, str, Callable[..., Any]]] = [
+            (network.encoder, "forward", self._timed(network.encoder.forward)),
+            (network.encoder, "at", self._cut(self._timed(network.encoder.at))),
+        ]
+        for owner, name in ((self.stage, "gains"), (network, "interaction_codes")):
+            if hasattr(owner, name):
+                patches.append((owner, name, self._noted(getattr(owner, name))))
         return _Patched(patches)
 
     def _noted(self, function: Callable[..., Any]) -> Callable[..., Any]:
