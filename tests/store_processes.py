@@ -1,4 +1,4 @@
-"""Processes that write a store at once, or are killed while they do; run as a script by test_store_crashes.py.
+"""Processes that write a store at once, or are killed while they do; run as a script by tests.
 
 It forks before any library has started a thread, which a test process cannot promise.
 """
@@ -13,8 +13,9 @@ from pathlib import Path
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
 from shared.store import Store
+from shared.store.place import is_url
 from tests.fabricate import fabricate_rollouts, fabricate_setting
-from tests.faults import Fault, bucket_faults
+from tests.faults import Fault, bucket_faults, disk_faults
 
 POINTS = 64
 
@@ -61,8 +62,9 @@ def kill_commits(path: Path) -> int:
     raise AssertionError("the commit never ended")
 
 
-def kill_in_bucket(url: str, kind: str) -> int:
+def kill_in_place(where: str, kind: str) -> int:
     """Commit rollout n in a child that is killed at its n-th write, for every one there is; how many there were."""
+    faults = bucket_faults if is_url(where) else disk_faults
     setting = fabricate_setting(points=POINTS)
     plan = Plan(setting=setting)
 
@@ -74,14 +76,14 @@ def kill_in_bucket(url: str, kind: str) -> int:
             os._exit(0)
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
 
-    in_child(lambda: Store.create(url, setting).add_plan(plan))
+    in_child(lambda: Store.create(where, setting).add_plan(plan))
     for step in range(1, 1000):
         job = Job(plan.key, step - 1, step)
         rollouts = fabricate_rollouts(plan, job, interactions=2)
 
         def work(job: Job = job, rollouts: list[RolloutRecord] = rollouts, step: int = step) -> None:
-            with bucket_faults(Fault(kind, step)):
-                Store.open(url).commit(plan, job, rollouts, {})
+            with faults(Fault(kind, step)):
+                Store.open(where).commit(plan, job, rollouts, {})
 
         if not in_child(work):
             return step
@@ -119,8 +121,8 @@ def race(path: Path, writers: int) -> int:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "kill-in-bucket":
-        print(kill_in_bucket(*sys.argv[2:]))
+    if sys.argv[1] == "kill-in-place":
+        print(kill_in_place(*sys.argv[2:]))
         sys.exit()
     task, folder = sys.argv[1], Path(sys.argv[2])
     print({"kill-commits": kill_commits, "kill-creations": kill_creations, "race": lambda p: race(p, 4)}[task](folder))

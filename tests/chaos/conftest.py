@@ -1,24 +1,22 @@
-"""What the chaos suite shares: the seed, the counts, and their table at the end."""
+"""What the chaos suite shares: the seed, the counts and their table at the end, objects, and places."""
 
 import os
-from collections.abc import Callable
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
 
-import numpy as np
 import pytest
 
+from tests.chaos.campaigns import COLLECT
 from tests.chaos.counts import Counts
+from tests.chaos.processes import Marked
 
 SEED_VARIABLE = "ADAAFFORD_CHAOS_SEED"
-LIMIT_S = 600
+LIMIT_S = 900
 """For tests that name no limit of their own."""
 
 COUNTS = Counts()
-
-Draw = Callable[[str], np.random.Generator]
-
-
-def seed_of_all() -> int:
-    return int(os.environ.get(SEED_VARIABLE, "1"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -28,7 +26,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary() -> None:
-    COUNTS.print(seed_of_all())
+    COUNTS.print(_seed())
+
+
+def _seed() -> int:
+    return int(os.environ.get(SEED_VARIABLE, "1"))
+
+
+@pytest.fixture
+def seed() -> int:
+    return _seed()
 
 
 @pytest.fixture
@@ -36,7 +43,31 @@ def counts() -> Counts:
     return COUNTS
 
 
+@pytest.fixture(scope="session")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of built-in objects."""
+    folder = tmp_path_factory.mktemp("objects")
+    arguments = ["--workers", "0", "--rollouts", "1", "--procedural-per-category", "4", "--store", str(folder / "s")]
+    assert Marked().start([*COLLECT, *arguments], folder / "log.txt").wait(200) == 0, (folder / "log.txt").read_text()
+    return folder / "s-objects"
+
+
 @pytest.fixture
-def draw() -> Draw:
-    """A generator by a name, the same whichever other tests run."""
-    return lambda name: np.random.default_rng([seed_of_all(), *name.encode()])
+def base(place: str, tmp_path: Path, request: pytest.FixtureRequest) -> str:
+    """Where stores go, by the kind of place."""
+    return str(tmp_path) if place == "disk" else str(request.getfixturevalue("s3_url"))
+
+
+@pytest.fixture(scope="session")
+def s3_environment(s3_endpoint: str) -> dict[str, str]:
+    """What names the S3 server, for processes that outlive a test."""
+    credentials = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_REGION": "us-east-1"}
+    return {**credentials, "AWS_ENDPOINT_URL": s3_endpoint}
+
+
+@pytest.fixture
+def ray_folder() -> Iterator[Path]:
+    """For Ray's sessions; not within a test's folder, since paths of sockets may have no more than 107 letters."""
+    folder = Path(tempfile.mkdtemp(prefix="ada", dir="/tmp"))
+    yield folder
+    shutil.rmtree(folder)

@@ -1,6 +1,6 @@
-"""The killer: runs a command until it is done, and kills some process of it at one random moment after the other.
+"""The killer: runs commands until they are done, and kills some process of theirs at one random moment after another.
 
-    killer = Killer(campaign, marked, witness, rng, counts)
+    killer = Killer(campaign, marked, look, rng, counts, folder)
     killer.harass(kills=8)      # then the campaign is done, and was looked at after each kill
 
 Moments and victims are drawn from the generator alone; `events` says what was done, so that a failure can be repeated.
@@ -15,133 +15,154 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from shared.errors import WorkerError
 from tests.chaos.counts import Counts
 from tests.chaos.processes import Marked, Role
-from tests.chaos.witness import Witness
 
-PATIENCE_S = 240.0
+PATIENCE_S = 300.0
 """How long a campaign that nobody disturbs any more may take."""
 LAST_BREATH_S = 120.0
-"""How long what a dead driver leaves may live on."""
+"""How long what the dead leave behind may live on; Ray's processes notice after a minute that nobody is there."""
+POLL_S = 0.05
+DEPENDED_ON = (Role.HEAD, Role.GCS, Role.ALL)
+"""What a driver cannot go on without, if it is its own node's."""
 
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """A command, and who of it may be killed when.
+    """Commands that run at the same time, and who of them may be killed when.
 
     Attributes:
         name: for the counts.
-        arguments: of `adaafford`.
-        store: folder or URL.
-        within_s: a moment is drawn uniformly from so many seconds after the start, or after the last kill.
+        commands: arguments of `adaafford`, each a command that can be given again.
+        within_s: a moment is drawn uniformly from so many seconds after the last kill.
         victims: roles by their odds.
     """
 
     name: str
-    arguments: Sequence[str]
-    store: str
+    commands: Sequence[Sequence[str]]
     within_s: float
     victims: Mapping[Role, float]
 
 
 @dataclass(slots=True)
 class Killer:
-    """Kills processes of one campaign.
+    """Kills processes of one campaign, and gives the commands that this ended again.
 
     Attributes:
         campaign: which one.
         marked: whoever may be killed.
-        witness: looks at the store after each kill.
+        look: looks at what was made, after each kill; raises AssertionError if a promise is broken.
         rng: draws moments and victims.
         counts: of all kills.
-        folder: for the log of the command.
-        mend: is called after each kill of what is not the command itself, to start it again where a user would.
+        folder: for the log of the commands.
+        mend: is called after each kill, to start again what is no command of the campaign's.
     """
 
     campaign: Campaign
     marked: Marked
-    witness: Witness
+    look: Callable[[], object]
     rng: np.random.Generator
     counts: Counts
     folder: Path
     mend: Callable[[Role], None] = lambda role: None
     events: list[str] = field(default_factory=list)
     kills: int = 0
+    _running: dict[int, psutil.Popen] = field(default_factory=dict)
+    """By number of the command; what is done is not there any more."""
+    _excused: set[int] = field(default_factory=set)
+    """Commands that were killed, or may rightly fail since what they depend on was."""
 
     def harass(self, kills: int) -> None:
-        """Run the campaign to its end; it is killed `kills` times at the most, less often if it ends before.
+        """Run the campaign to its end; it is struck `kills` times at the most, less often if it ends before.
 
         Raises:
-            AssertionError: the store broke a promise, or the command failed of itself.
+            AssertionError: a promise is broken, or a command failed of itself.
         """
+        self.folder.mkdir(parents=True, exist_ok=True)
         try:
-            while not self._attempt(kills):
-                pass
-            self.witness.look()
-            self._await_the_last_breath()
+            for number in range(len(self.campaign.commands)):
+                self._start(number)
+            while self.kills < kills and self._lives_for(self.campaign.within_s * self.rng.random()):
+                role = self._strike()
+                self.look()
+                if role is not None:
+                    self.mend(role)
+            assert not self._lives_for(PATIENCE_S), f"undisturbed at last, and not done within {PATIENCE_S:g} s"
+            self.look()
         except BaseException as error:
-            error.add_note("\n".join([self.campaign.name, *self.events, self.log.read_text()[-3000:]]))
+            error.add_note("\n".join([self.campaign.name, *self.events, self.log.read_text()[-5000:]]))
+            for process in self.marked.left():
+                end(process)
             raise
 
     @property
     def log(self) -> Path:
-        """What the command printed."""
+        """What the commands printed."""
         return self.folder / "log.txt"
 
-    def _attempt(self, kills: int) -> bool:
-        """Start the command, and see it to its end; whether it was done then."""
-        command = self.marked.start(self.campaign.arguments, self.log)
-        excused = False
-        while self.kills < kills and self._lives_for(command, self.campaign.within_s * self.rng.random()):
-            role = self._kill(command)
-            excused |= role is not None
-            self.witness.look()
-            if role is not None:
-                self.mend(role)
-        code = self._end_of(command)
-        self.events.append(f"the command ended with {code}")
-        assert code == 0 or excused, f"the command failed with {code}"
-        return code == 0
+    def _start(self, number: int) -> None:
+        self._excused.discard(number)
+        self._running[number] = self.marked.start(self.campaign.commands[number], self.log)
 
-    def _lives_for(self, command: psutil.Popen, seconds: float) -> bool:
-        """Wait; whether the command still runs then."""
-        try:
-            command.wait(seconds)
-        except psutil.TimeoutExpired:
-            return True
-        return False
+    def _lives_for(self, seconds: float) -> bool:
+        """Wait, and give again what was ended by a kill; whether there is anything left to do then."""
+        deadline = time.monotonic() + seconds
+        while True:
+            for number, command in list(self._running.items()):
+                code = command.poll()
+                if code == 0:
+                    del self._running[number]
+                elif code is not None:
+                    self._note(f"`{self.campaign.commands[number][0]}` ended with {code}")
+                    assert number in self._excused, f"a command failed of itself, with {code}"
+                    assert code in (-signal.SIGKILL, WorkerError.exit_code), f"a command ended with {code}"
+                    self._start(number)
+            if not self._running or time.monotonic() > deadline:
+                return bool(self._running)
+            time.sleep(POLL_S)
 
-    def _end_of(self, command: psutil.Popen) -> int:
-        try:
-            return int(command.wait(PATIENCE_S))
-        except psutil.TimeoutExpired:
-            command.kill()
-            raise AssertionError(f"nobody disturbed it any more, and yet it took more than {PATIENCE_S:g} s") from None
-
-    def _kill(self, command: psutil.Popen) -> Role | None:
+    def _strike(self) -> Role | None:
         """Kill somebody; returns who it was, None if nobody of the drawn role lives."""
         roles = list(self.campaign.victims)
         odds = np.array([self.campaign.victims[role] for role in roles])
         role = roles[int(self.rng.choice(len(roles), p=odds / odds.sum()))]
+        which = self.rng.random()
         living = sorted(self.marked.in_role(role), key=lambda process: process.pid)
-        victims = living if role is Role.ALL else living[int(self.rng.integers(len(living))) :][:1] if living else []
-        for victim in victims:
-            try:
-                victim.send_signal(signal.SIGKILL)
-            except psutil.NoSuchProcess:
-                return None
-        if not victims:
+        victims = living if role is Role.ALL else living[int(which * len(living)) :][:1]
+        own = {command.pid: number for number, command in self._running.items()}
+        self._excused |= set(own.values()) if role in DEPENDED_ON else {own[v.pid] for v in victims if v.pid in own}
+        if not sum(map(end, victims)):
+            self._note(f"no {role} lives")
             return None
         self.kills += 1
         self.counts.killed(self.campaign.name, role)
-        self.events.append(f"{time.strftime('%H:%M:%S')} killed: {role}, one of {len(living)}")
-        if role in (Role.DRIVER, Role.ALL):
-            command.wait()
+        self._note(f"killed: {role}")
         return role
 
-    def _await_the_last_breath(self) -> None:
-        """See that nothing is left behind that would live for ever."""
-        deadline = time.monotonic() + LAST_BREATH_S
-        while self.marked.living():
-            assert time.monotonic() < deadline, [process.cmdline()[:3] for process in self.marked.living()]
-            time.sleep(0.2)
+    def _note(self, event: str) -> None:
+        self.events.append(f"{time.strftime('%H:%M:%S')} {event}")
+
+
+def await_last_breath(everybody: Sequence[Marked]) -> None:
+    """See that nothing is left behind that would live for ever.
+
+    Raises:
+        AssertionError: something is.
+    """
+    deadline = time.monotonic() + LAST_BREATH_S
+    while living := [process for marked in everybody for process in marked.left()]:
+        assert time.monotonic() < deadline, f"left behind: {living}"
+        time.sleep(POLL_S)
+
+
+def end(process: psutil.Process) -> bool:
+    """Kill a process, and wait until it is dead; whether it still lived."""
+    try:
+        process.send_signal(signal.SIGKILL)
+        # Waited for as any other's child is, since whoever started it wants its exit code.
+        while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+            time.sleep(0.001)
+    except psutil.NoSuchProcess:
+        return False
+    return True

@@ -3,7 +3,7 @@
 import os
 import sys
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -22,10 +22,16 @@ class Role(StrEnum):
     DRIVER = "driver"
     ACTOR = "actor"
     RAYLET = "raylet"
+    """Of a node that may leave."""
+    HEAD = "head's raylet"
     GCS = "gcs server"
     LEARNER = "learner"
     ALL = "all at once"
     """No role of one process: everything that bears the mark, as a machine's power cut takes it."""
+
+
+COMMANDS = {Role.DRIVER, Role.LEARNER, Role.ACTOR}
+"""What lives no longer than the command that it belongs to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +40,12 @@ class Marked:
 
     Attributes:
         environment: variables that differ from this process's.
+        outlives: whether there is a Ray cluster among them that stays when the commands are done.
         mark: no other processes bear it.
     """
 
-    environment: dict[str, str] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=dict)
+    outlives: bool = False
     mark: str = field(default_factory=lambda: uuid.uuid4().hex)
 
     def start(self, arguments: Sequence[str], log: Path) -> psutil.Popen:
@@ -67,6 +75,11 @@ class Marked:
             return self.living()
         return [process for process in self.living() if role_of(process) is role]
 
+    def left(self) -> list[psutil.Process]:
+        """What should be gone once all commands have ended."""
+        living = self.living()
+        return [process for process in living if role_of(process) in COMMANDS] if self.outlives else living
+
     def _bears(self, process: psutil.Process) -> bool:
         try:
             return process.status() != psutil.STATUS_ZOMBIE and process.environ().get(MARK) == self.mark
@@ -85,8 +98,7 @@ def role_of(process: psutil.Process) -> Role | None:
     if command[0].startswith("ray::WorkerActor"):
         return Role.ACTOR
     if command[0].endswith("/raylet"):
-        # A head's raylet serves the driver; the campaign depends on it as on the driver.
-        return Role.RAYLET
+        return Role.HEAD if "--head" in command else Role.RAYLET
     if command[0].endswith("/gcs_server"):
         return Role.GCS
     if PROGRAM in command[:3]:

@@ -1,0 +1,62 @@
+"""A Ray cluster on this machine that outlives drivers: a head without CPUs, and two nodes that may go and come."""
+
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from tests.chaos.killer import end
+from tests.chaos.processes import Marked, Role
+
+NODES = 2
+START = ("from ray.scripts.scripts import main; main()", "start", "--disable-usage-stats")
+PORTS = ("--min-worker-port=0", "--max-worker-port=0", f"--object-store-memory={80_000_000}")
+
+
+class RayCluster:
+    """Starts with the first `mend`; has token authentication, as clusters should.
+
+    Args:
+        environment: variables that its processes have, and its drivers.
+    """
+
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        # Not within a test's folder: the paths of Ray's sockets may have no more than 107 letters.
+        self._folder = Path(tempfile.mkdtemp(prefix="ada", dir="/tmp"))
+        with socket.socket() as free:
+            free.bind(("", 0))
+            port = free.getsockname()[1]
+        self.address = f"127.0.0.1:{port}"
+        self._port = port
+        token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0123456789abcdef" * 2}
+        self.marked = Marked({**environment, **token}, outlives=True)
+
+    def mend(self, role: Role | None = None) -> None:
+        """Start what is missing, after something in this role was killed."""
+        if not self.marked.in_role(Role.HEAD):
+            self.close_all()
+            self._start("--head", f"--port={self._port}", "--num-cpus=0", f"--temp-dir={self._folder}/ray")
+        for _ in range(NODES - len(self.marked.in_role(Role.RAYLET))):
+            self._start(f"--address={self.address}", "--num-cpus=1")
+
+    def close_all(self) -> None:
+        """Kill everything."""
+        while living := self.marked.living():
+            for process in living:
+                end(process)
+
+    def close(self) -> None:
+        """Kill everything, and leave nothing."""
+        self.close_all()
+        shutil.rmtree(self._folder)
+
+    def _start(self, *arguments: str) -> None:
+        log = self._folder / "log.txt"
+        deadline = time.monotonic() + 100
+        dashboard = ["--include-dashboard=false"] if "--head" in arguments else []
+        command = [sys.executable, "-c", *START, *arguments, *PORTS, *dashboard]
+        while self.marked.execute(command, log).wait(100) != 0:
+            assert time.monotonic() < deadline, log.read_text()[-3000:]
