@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cluster.blame import MAX_FAULTS, MAX_LOSSES
-from cluster.fleet import Fleet, WorkerFactory
+from cluster.fleet import Fleet, SerialFleet
 from cluster.orders import Listed, Order
 from cluster.session import fleets
 from collector.guard import Limits
@@ -22,33 +22,34 @@ from shared.plan import Job, ObjectRef, Plan, Setting, missing_jobs
 from shared.underway import Underway
 from tests.fake_worker import FakeReceipt, FakeWorker
 
-MakeFleet = Callable[[WorkerFactory, Underway], Fleet]
 LIMITS = Limits(rollout_s=2.0, memory_mb=1000.0)
 
 
 @pytest.fixture(scope="module")
-def ray_fleets() -> Iterator[MakeFleet]:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Fleet, Path]]:
+    """A fleet of processes, which take seconds to start, and the link that says in which folder it works."""
+    base = tmp_path_factory.mktemp("fleet")
     with fleets(workers=2, limits=LIMITS) as make:
-        yield make
-
-
-@pytest.fixture(params=["serial", "ray"])
-def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
-    factory = partial(FakeWorker, tmp_path)
-    if request.param == "ray":
-        fleet = request.getfixturevalue("ray_fleets")(factory, Underway(tmp_path / "underway"))
-        yield fleet
-        fleet.close()
-    else:
-        with fleets(workers=0, limits=LIMITS) as make:
-            yield make(factory, Underway(tmp_path / "underway"))
+        yield make(partial(FakeWorker, base / "now"), Underway(base / "underway")), base / "now"
 
 
 @pytest.fixture
-def ray_fleet(ray_fleets: MakeFleet, tmp_path: Path) -> Iterator[Fleet]:
-    fleet = ray_fleets(partial(FakeWorker, tmp_path), Underway(tmp_path / "underway"))
+def ray_fleet(shared: tuple[Fleet, Path], tmp_path: Path) -> Iterator[Fleet]:
+    fleet, link = shared
+    link.unlink(missing_ok=True)
+    link.symlink_to(tmp_path)
+    fleet.restarts = 0
     yield fleet
-    fleet.close()
+    assert Underway(link.parent / "underway").sweep() == 0, "processes that ended have left something"
+
+
+@pytest.fixture(params=["serial", "ray"])
+def fleet(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    monkeypatch.setattr("cluster.fleet.WAIT_S", 0.02)
+    if request.param == "ray":
+        found: Fleet = request.getfixturevalue("ray_fleet")
+        return found
+    return SerialFleet(partial(FakeWorker, tmp_path))
 
 
 def plan(proposer: str = "random", version: int = 0) -> Plan:
@@ -173,8 +174,6 @@ def test_a_rollout_that_crashes_costs_itself_alone(ray_fleet: Fleet, tmp_path: P
     assert re.fullmatch(
         r"Segmentation fault, in string_at \(.*\) of _misbehave \(fake_worker.py:\d+\) \(3 times\)", reason
     )
-    ray_fleet.close()
-    assert list((tmp_path / "underway").iterdir()) == []
 
 
 def test_a_rollout_that_hangs_is_ended_with_a_traceback(ray_fleet: Fleet, tmp_path: Path) -> None:
