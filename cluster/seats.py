@@ -5,7 +5,7 @@ nothing here goes through all of them.
 """
 
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -78,9 +78,10 @@ class Seats:
 
     def __init__(self, count: int) -> None:
         self._all = [Seat() for _ in range(count)]
-        self._empty: dict[Seat, None] = dict.fromkeys(self._all)
-        self._called: dict[Seat, None] = {}
-        self._hungry: tuple[dict[Seat, None], ...] = tuple({} for _ in range(IN_FLIGHT))
+        # Unlike a plain dict's, its first entry is found at once, however many before that were removed.
+        self._empty = OrderedDict[Seat, None].fromkeys(self._all)
+        self._called = OrderedDict[Seat, None]()
+        self._hungry = tuple(OrderedDict[Seat, None]() for _ in range(IN_FLIGHT))
         """By how many jobs they hold."""
         self._next_look = 0
 

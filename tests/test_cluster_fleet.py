@@ -4,16 +4,21 @@ import logging
 import os
 import re
 import signal
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from types import FrameType
 
 import pytest
 
 from cluster.blame import MAX_FAULTS, MAX_LOSSES
 from cluster.fleet import Fleet, SerialFleet
 from cluster.orders import Listed, Order
+from cluster.ray_fleet import RayFleet
+from cluster.seats import IN_FLIGHT
 from cluster.session import fleets
 from collector.guard import Limits
 from shared.configuration import CollectionConfig
@@ -256,3 +261,75 @@ def test_an_interrupt_leaves_no_actor_at_work(ray_fleet: Fleet, tmp_path: Path) 
     finally:
         signal.signal(signal.SIGINT, before)
     assert not any(seat.orders for seat in ray_fleet._seats)  # type: ignore[attr-defined]
+
+
+class InstantActor:
+    """An actor without a process: it answers at once, or never, or the other way round."""
+
+    def __init__(self, number: int, comes: bool = True, backwards: bool = False) -> None:
+        self._name, self._comes, self._backwards = f"host-1~{number}~1", comes, backwards
+        self._held: list[tuple[Future[FakeReceipt], FakeReceipt]] = []
+
+    def arrive(self) -> "Future[str]":
+        answer: Future[str] = Future()
+        if self._comes:
+            answer.set_result(self._name)
+        return answer
+
+    def run(
+        self, plan: object, job: Job, policy: list[object], quarantined: Mapping[int, str]
+    ) -> "Future[FakeReceipt]":
+        answer: Future[FakeReceipt] = Future()
+        self._held.append((answer, FakeReceipt(job.shard_id, 1, 4, 1, {"ok": 4}, {"total": 0.01})))
+        if len(self._held) == (IN_FLIGHT if self._backwards else 1):
+            for future, receipt in reversed(self._held):
+                future.set_result(receipt)
+            self._held.clear()
+        return answer
+
+    def end(self) -> None: ...
+
+
+def instant_fleet(folder: Path, actors: Iterable[InstantActor], count: int) -> RayFleet:
+    return RayFleet(make_nothing, Underway(folder), count, LIMITS, partial(next, iter(actors)))
+
+
+def make_nothing() -> FakeWorker:
+    raise AssertionError("these actors have no worker")
+
+
+def test_no_job_waits_for_an_actor_that_never_comes(ray_fleet: Fleet, tmp_path: Path) -> None:
+    fleet = instant_fleet(tmp_path, [InstantActor(0, comes=False), InstantActor(1)], 2)
+    assert run(fleet, 9) == [job.shard_id for job in jobs(9)]
+    assert run(fleet, 9) == [job.shard_id for job in jobs(9)]
+    assert fleet.restarts == 0
+
+
+def test_answers_are_taken_in_the_order_of_what_was_asked(ray_fleet: Fleet, tmp_path: Path) -> None:
+    fleet = instant_fleet(tmp_path, [InstantActor(0, backwards=True)], 1)
+    receipts: list[FakeReceipt] = []
+    fleet.run(Listed(plan(), jobs(8)), receipts.append)
+    assert [receipt.shard_id for receipt in receipts] == [job.shard_id for job in jobs(8)]
+
+
+def test_a_shard_costs_the_driver_the_same_however_many_actors_there_are(ray_fleet: Fleet, tmp_path: Path) -> None:
+    few, many = (calls_a_shard(instant_fleet(tmp_path, map(InstantActor, range(n)), n), n) for n in (10, 1000))
+    assert many < 1.1 * few
+
+
+def calls_a_shard(fleet: RayFleet, actors: int, shards: int = 1500) -> float:
+    """How many functions are called for a shard once all actors are up; unlike time, the same on a busy machine."""
+    fleet._poll_s = 60.0  # Looking for hung actors goes by time, not by shard.
+    run(fleet, 2 * actors)
+    orders, calls = Listed(plan(), jobs(shards)), 0
+
+    def count(frame: FrameType, event: str, argument: object) -> None:
+        nonlocal calls
+        calls += event in ("call", "c_call")
+
+    sys.setprofile(count)
+    try:
+        fleet.run(orders, lambda receipt: None)
+    finally:
+        sys.setprofile(None)
+    return calls / shards

@@ -82,7 +82,7 @@ class FleetBenchmark:
         self, plan: Plan, guests: Sequence[int], processes: Sequence[int], shards_per_s: float, seconds: float
     ) -> None:
         self._plan = plan
-        self._sizes = [("guest", size) for size in guests] + [("process", size) for size in processes]
+        self._sizes = {"guest": guests, "process": processes}
         self._shards_per_s = shards_per_s
         self._seconds = seconds
         self.points: list[FleetPoint] = []
@@ -90,21 +90,27 @@ class FleetBenchmark:
     @property
     def turns(self) -> int:
         """How often `run` will call `advance`."""
-        return len(self._sizes)
+        return sum(map(len, self._sizes.values()))
 
     def run(self, advance: Advance) -> None:
         """Measure."""
-        for kind, actors in self._sizes:
-            self.points.append(self._measure(kind, actors))
-            advance()
+        for kind, sizes in self._sizes.items():
+            if not sizes:
+                continue
+            with ray_session(max(sizes) if kind == "process" else 1):
+                for actors in sizes:
+                    self.points.append(self._measure(kind, actors))
+                    advance()
 
     def _measure(self, kind: str, actors: int) -> FleetPoint:
         job_s = actors / self._shards_per_s
         each = max(2, round(self._seconds / job_s))
         with ExitStack() as stack:
             scratch = Path(stack.enter_context(TemporaryDirectory(prefix="adaafford-bench-")))
-            stack.enter_context(ray_session(actors if kind == "process" else 1))
-            call = Dormitories(-(-actors // BEDS), BEDS, job_s) if kind == "guest" else None
+            call = None
+            if kind == "guest":
+                call = Dormitories(-(-actors // BEDS), BEDS, job_s)
+                stack.callback(call.close)
             underway = Underway(scratch / "underway")
             limits = Limits(rollout_s=max(300.0, 2 * job_s))
             fleet = RayFleet(partial(Sleeper, job_s), underway, actors, limits, call)

@@ -93,7 +93,7 @@ class _Guest:
         return answer
 
     def end(self) -> None:
-        """The dormitory ends with the session."""
+        """The dormitory goes on: others live there."""
 
 
 class Dormitories:
@@ -116,3 +116,8 @@ class Dormitories:
         bed, index = divmod(self._given, len(self._processes))
         self._given += 1
         return _Guest(self._processes[index], bed)
+
+    def close(self) -> None:
+        """End the processes."""
+        for process in self._processes:
+            ray.kill(process)
