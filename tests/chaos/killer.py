@@ -19,9 +19,9 @@ from shared.errors import WorkerError
 from tests.chaos.counts import Counts
 from tests.chaos.processes import Marked, Role
 
-PATIENCE_S = 300.0
+PATIENCE_S = 900.0
 """How long a campaign that nobody disturbs any more may take."""
-LAST_BREATH_S = 120.0
+LAST_BREATH_S = 300.0
 """How long what the dead leave behind may live on; Ray's processes notice after a minute that nobody is there."""
 POLL_S = 0.05
 DEPENDED_ON = (Role.HEAD, Role.GCS, Role.ALL)

@@ -12,9 +12,9 @@ from tests.chaos.witness import Witness
 
 pytestmark = pytest.mark.chaos
 
-ROLLOUTS = 24
-PATIENCE_S = 200.0
-TIMES = 3
+ROLLOUTS = 12
+PATIENCE_S = 900.0
+TIMES = 2
 
 
 def both(folder: Path, commands: list[list[str]]) -> list[tuple[int, str]]:
