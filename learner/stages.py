@@ -16,6 +16,7 @@ OUT/ of a stage
 import hashlib
 import json
 from collections.abc import Collection
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from learner.oracle import read_oracle
 from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FILE, ORACLE_FOLDER, Recipe, Runner
 from learner.training import CHECKPOINT_FILE, TrainingResult, without_nan
 from shared.errors import StoreError, UsageError
-from shared.files import read_bounded, write_atomically
+from shared.files import exclusive_lock, read_bounded, write_atomically
 from shared.methods import ModuleName
 from shared.policy import (
     MAX_POLICY_JSON_BYTES,
@@ -44,6 +45,7 @@ from shared.store.store import Store
 
 DONE_FILE = "done.json"
 CONFIG_FILE = "config.json"
+LOCK_FILE = ".lock-learner"
 MAX_DONE_BYTES = 16 << 20
 """done.json names every object that was seen, in some 70 bytes each."""
 CHECKPOINT_FOLDERS = ("", ORACLE_FOLDER, AFFORDANCE_FOLDER)
@@ -90,7 +92,7 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
 
     Raises:
         UsageError: the store or the policy is missing or of another task, objects leak between the parts, or `out`
-            holds another run.
+            holds another run, or is being written by another learner.
         StoreError: the store, the policy or a checkpoint is damaged.
     """
     store = Store.open(job.store)
@@ -110,6 +112,22 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
         job.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out {job.out}: cannot be made ({error.strerror}); choose another folder") from None
+    with exclusive_lock(job.out / LOCK_FILE) if sharing.rank() == 0 else nullcontext():
+        _train(job, config, store, policy, oracle, fingerprint, hardware or Hardware())
+    _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
+    return policy
+
+
+def _train(
+    job: StageJob,
+    config: LearnerConfig,
+    store: Store,
+    policy: Policy,
+    oracle: Path | None,
+    fingerprint: str,
+    hardware: Hardware,
+) -> None:
+    """Train the policy, and leave it in the stage's folder, which no other learner writes meanwhile."""
     _check_checkpoints(job.out, fingerprint)
     dataset = load_dataset(store, policy.config)
     parts = split(dataset, job.train_objects, job.validation_objects)
@@ -121,7 +139,6 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
     )
     if sharing.rank() == 0:
         write_atomically(job.out / CONFIG_FILE, config.model_dump_json(indent=1).encode())
-    hardware = hardware or Hardware()
     policy.modules().to(hardware.device)
     with hardware.home():
         runner = Runner(job.out, config.seed, fingerprint, hardware)
@@ -134,8 +151,6 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
             write_atomically(job.out / ORACLE_FILE, read_bounded(oracle, MAX_WEIGHTS_BYTES))
         _finish(job, policy, result, fingerprint, _seen(job, store, dataset, parts))
     sharing.wait_for_all()
-    _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
-    return policy
 
 
 def _finish(job: StageJob, policy: Policy, result: TrainingResult, fingerprint: str, seen: Collection[str]) -> None:

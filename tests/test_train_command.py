@@ -25,9 +25,10 @@ from learner.data import load_dataset, split, without_later
 from learner.hardware import Hardware
 from learner.names import METRICS_FILE
 from learner.progress import ProgressReport, Standing
-from learner.stages import DONE_FILE, StageJob, run_stage
+from learner.stages import DONE_FILE, LOCK_FILE, StageJob, run_stage
 from learner.training import CHECKPOINT_FILE
 from shared.errors import UsageError
+from shared.files import exclusive_lock
 from shared.plan import Job
 from shared.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.store.store import Store
@@ -357,3 +358,15 @@ def test_two_processes_take_the_steps_of_one(store: Path, tmp_path: Path, stage:
     for alone, shared in zip(*curves, strict=True):
         assert shared["loss_critic"] == pytest.approx(alone["loss_critic"], rel=1e-4)
         assert shared["score"] == pytest.approx(alone["score"], rel=1e-4)
+
+
+def test_a_second_learner_in_the_same_folder_is_refused(
+    store: Path, config_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    told = ["train", "prior", "--store", str(store), "--out", str(out), "--config", str(config_file)]
+    with exclusive_lock(out / LOCK_FILE):
+        assert run(told) == 2
+    assert "is in use by process" in capsys.readouterr().err
+    assert not (out / WEIGHTS_FILE).exists()
