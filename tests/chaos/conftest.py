@@ -10,6 +10,7 @@ import pytest
 
 from tests.chaos.campaigns import COLLECT
 from tests.chaos.counts import Counts
+from tests.chaos.killer import await_last_breath
 from tests.chaos.processes import Marked
 
 SEED_VARIABLE = "ADAAFFORD_CHAOS_SEED"
@@ -65,9 +66,17 @@ def s3_environment(s3_endpoint: str) -> dict[str, str]:
     return {**credentials, "AWS_ENDPOINT_URL": s3_endpoint}
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def ray_folder() -> Iterator[Path]:
     """For Ray's sessions; not within a test's folder, since paths of sockets may have no more than 107 letters."""
     folder = Path(tempfile.mkdtemp(prefix="ada", dir="/tmp"))
     yield folder
     shutil.rmtree(folder)
+
+
+@pytest.fixture(scope="session")
+def everybody(ray_folder: Path) -> Iterator[list[Marked]]:
+    """All that were started; asked for in the end, once, whether they are gone, since Ray's agents take a minute."""
+    started: list[Marked] = []
+    yield started
+    await_last_breath(started)

@@ -3,7 +3,7 @@
     killer = Killer(campaign, marked, look, rng, counts, folder)
     killer.harass(kills=8)      # then the campaign is done, and was looked at after each kill
 
-Moments and victims are drawn from the generator alone; `events` says what was done, so that a failure can be repeated.
+Moments and victims are drawn from the generator alone; events.txt, beside the commands' log, says what was done.
 """
 
 import signal
@@ -142,6 +142,7 @@ class Killer:
 
     def _note(self, event: str) -> None:
         self.events.append(f"{time.strftime('%H:%M:%S')} {event}")
+        (self.folder / "events.txt").write_text("\n".join([*self.events, ""]))
 
 
 def await_last_breath(everybody: Sequence[Marked]) -> None:

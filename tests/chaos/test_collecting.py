@@ -39,27 +39,35 @@ def collecting(base: str, *flags: str) -> Callable[[str], Trial]:
     return trial
 
 
-def test_a_driver_without_ray_on_a_disk(tmp_path: Path, seed: int, counts: Counts) -> None:
+def test_a_driver_without_ray_on_a_disk(tmp_path: Path, seed: int, counts: Counts, everybody: list[Marked]) -> None:
     """Objects are built anew by each, so that it is killed while it builds them, too."""
-    siege = Siege(SERIAL_DISK, {Role.DRIVER: 1.0}, tmp_path, seed, counts)
+    siege = Siege(SERIAL_DISK, {Role.DRIVER: 1.0}, tmp_path, seed, counts, everybody)
     siege.lay(
         collecting(str(tmp_path), "--workers", "0", "--rollouts", "24", "--procedural-per-category", "2"), at_once=2
     )
 
 
 def test_a_driver_without_ray_in_a_bucket(
-    tmp_path: Path, s3_url: str, objects: Path, seed: int, counts: Counts
+    tmp_path: Path, s3_url: str, objects: Path, seed: int, counts: Counts, everybody: list[Marked]
 ) -> None:
-    siege = Siege(SERIAL_BUCKET, {Role.DRIVER: 1.0}, tmp_path, seed, counts)
+    siege = Siege(SERIAL_BUCKET, {Role.DRIVER: 1.0}, tmp_path, seed, counts, everybody)
     siege.lay(collecting(s3_url, "--workers", "0", "--rollouts", "24", "--objects", str(objects)), at_once=2)
 
 
 @pytest.mark.parametrize(("name", "place"), [(SESSION_DISK, "disk"), (SESSION_BUCKET, "bucket")])
 def test_any_process_of_a_session_of_its_own(
-    name: str, place: str, base: str, ray_folder: Path, tmp_path: Path, objects: Path, seed: int, counts: Counts
+    name: str,
+    place: str,
+    base: str,
+    ray_folder: Path,
+    tmp_path: Path,
+    objects: Path,
+    seed: int,
+    counts: Counts,
+    everybody: list[Marked],
 ) -> None:
     environment = {"RAY_TMPDIR": str(ray_folder), "RAY_gcs_rpc_server_reconnect_timeout_s": "5"}
-    siege = Siege(name, IN_SESSION, tmp_path, seed, counts, lambda: Marked(environment), most=7)
+    siege = Siege(name, IN_SESSION, tmp_path, seed, counts, everybody, lambda: Marked(environment), most=7)
     siege.lay(collecting(base, "--workers", "2", "--rollouts", "40", "--objects", str(objects)))
 
 
@@ -73,8 +81,18 @@ def cluster(s3_environment: dict[str, str]) -> Iterator[RayCluster]:
 
 @pytest.mark.parametrize(("name", "place"), [(CLUSTER_DISK, "disk"), (CLUSTER_BUCKET, "bucket")])
 def test_any_process_of_a_cluster(
-    name: str, place: str, base: str, cluster: RayCluster, tmp_path: Path, objects: Path, seed: int, counts: Counts
+    name: str,
+    place: str,
+    base: str,
+    cluster: RayCluster,
+    tmp_path: Path,
+    objects: Path,
+    seed: int,
+    counts: Counts,
+    everybody: list[Marked],
 ) -> None:
-    siege = Siege(name, IN_CLUSTER, tmp_path, seed, counts, lambda: cluster.marked, cluster.mend, most=16, within_s=6.0)
+    siege = Siege(
+        name, IN_CLUSTER, tmp_path, seed, counts, everybody, lambda: cluster.marked, cluster.mend, most=16, within_s=6.0
+    )
     flags = ["--workers", "2", "--rollouts", "80", "--objects", str(objects), "--ray-address", cluster.address]
     siege.lay(collecting(base, *flags))

@@ -42,7 +42,9 @@ def fill(store: Path, objects: Path, folder: Path) -> None:
     assert Marked().start([*TO_LEARN_FROM, *arguments], log).wait(200) == 0, log.read_text()
 
 
-def test_a_learner_from_the_prior_to_the_last_round(collected: Path, tmp_path: Path, seed: int, counts: Counts) -> None:
+def test_a_learner_from_the_prior_to_the_last_round(
+    collected: Path, tmp_path: Path, seed: int, counts: Counts, everybody: list[Marked]
+) -> None:
     settings = learner_file(tmp_path)
 
     def trial(name: str) -> Trial:
@@ -50,11 +52,11 @@ def test_a_learner_from_the_prior_to_the_last_round(collected: Path, tmp_path: P
         command = ["train", "alternate", "--store", str(collected), "--out", str(out), "--config", str(settings)]
         return Trial([command], LearnerWitness(out).look, lambda: policies_in(out))
 
-    Siege(TRAINING, {Role.LEARNER: 1.0}, tmp_path, seed, counts).lay(trial, at_once=2)
+    Siege(TRAINING, {Role.LEARNER: 1.0}, tmp_path, seed, counts, everybody).lay(trial, at_once=2)
 
 
 def test_a_learner_beside_collection(
-    ray_folder: Path, tmp_path: Path, objects: Path, seed: int, counts: Counts
+    ray_folder: Path, tmp_path: Path, objects: Path, seed: int, counts: Counts, everybody: list[Marked]
 ) -> None:
     """Collectors on Ray wait for each policy, and the learner for rollouts of the last one."""
     settings = learner_file(tmp_path)
@@ -77,11 +79,13 @@ def test_a_learner_beside_collection(
 
     victims = {Role.LEARNER: 5.0, Role.DRIVER: 4.0, Role.ACTOR: 3.0, Role.HEAD: 1.0}
     environment = {"RAY_TMPDIR": str(ray_folder)}
-    siege = Siege(BESIDE, victims, tmp_path, seed, counts, lambda: Marked(environment), most=7)
+    siege = Siege(
+        BESIDE, victims, tmp_path, seed, counts, everybody, lambda: Marked(environment), most=7, within_s=10.0
+    )
     siege.lay(trial)
 
 
-def test_a_whole_campaign(ray_folder: Path, tmp_path: Path, seed: int, counts: Counts) -> None:
+def test_a_whole_campaign(ray_folder: Path, tmp_path: Path, seed: int, counts: Counts, everybody: list[Marked]) -> None:
     settings = run_file(tmp_path)
 
     def trial(name: str) -> Trial:
@@ -97,4 +101,5 @@ def test_a_whole_campaign(ray_folder: Path, tmp_path: Path, seed: int, counts: C
 
     victims = {Role.LEARNER: 3.0, Role.DRIVER: 3.0, Role.ACTOR: 3.0, Role.HEAD: 1.0, Role.ALL: 1.0}
     environment = {"RAY_TMPDIR": str(ray_folder)}
-    Siege(WHOLE, victims, tmp_path, seed, counts, lambda: Marked(environment)).lay(trial)
+    siege = Siege(WHOLE, victims, tmp_path, seed, counts, everybody, lambda: Marked(environment), within_s=20.0)
+    siege.lay(trial)
