@@ -1,6 +1,7 @@
 """The benchmark of scaling: its arithmetic, the stores that it makes up, and the actors that sleep."""
 
 import asyncio
+import dataclasses
 import json
 from pathlib import Path
 
@@ -20,8 +21,8 @@ PLAN = Plan(setting=SETTING)
 WISH = Wish(actors=1000, interactions=10**6, per_rollout=32, interactions_per_s=100.0)
 
 
-def point(actors: int, driver_ms: float) -> FleetPoint:
-    return FleetPoint("guest", actors, 1.0, 100, 2.0, driver_ms, 0.1, 0.99, 200.0, 0.0)
+def point(job_s: float, driver_ms: float) -> FleetPoint:
+    return FleetPoint("guest", 100, job_s, 100, 2.0, driver_ms, 0.1, 0.99, 200.0, 0.0)
 
 
 @pytest.fixture
@@ -50,9 +51,15 @@ def test_larger_shards_unburden_the_driver_in_proportion() -> None:
 def test_noise_that_makes_the_large_look_cheap_is_not_believed() -> None:
     stores = [StorePoint(10, 0.1, 0.0, None, 1.0, 1.0)]
     found = predictions([point(10, 2.0), point(100, 1.0)], stores, WISH)
-    assert found["driver_ms_by_actors"] == {"at_zero": 2.0, "slope": 0.0}
+    assert found["driver_ms_by_job_s"] == {"at_zero": 2.0, "slope": 0.0}
     rising = predictions([point(10, 1.0), point(110, 2.0)], stores, WISH)
-    assert rising["driver_ms_by_actors"]["slope"] == pytest.approx(0.01)
+    assert rising["driver_ms_by_job_s"]["slope"] == pytest.approx(0.01)
+
+
+def test_actors_with_a_process_lift_the_prediction() -> None:
+    stores = [StorePoint(10, 0.1, 0.0, None, 1.0, 1.0)]
+    fleets = [point(10, 1.0), point(110, 2.0), dataclasses.replace(point(60, 2.5), kind="process")]
+    assert predictions(fleets, stores, WISH)["driver_ms_by_job_s"]["at_zero"] == pytest.approx(0.9 + 1.0)
 
 
 def test_a_made_up_store_is_listed_as_a_real_one_and_takes_further_shards(template: Store, tmp_path: Path) -> None:

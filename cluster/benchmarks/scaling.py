@@ -1,7 +1,9 @@
 """How a fleet's driver scales: its processor time and memory by number of actors, with actors that sleep.
 
-What is measured is fitted by two lines, processor time of the driver for a shard by actors, and listing of a store by
-shards; these say what more actors and more interactions would take.
+What is measured is fitted by two lines: processor time of the driver for a shard by the length of a job, and listing of
+a store by shards. These say what more actors and more interactions would take. Why by the length of a job: all that the
+driver does for each actor and not for each shard, it does every second (it looks for hung ones), and an actor makes
+1 / length shards a second.
 """
 
 import time
@@ -33,7 +35,7 @@ BEDS = 100
 PER_SHARD = 4
 LOOK_EVERY = 10
 """Shards, at the driver's memory."""
-PREDICTED_PER_SHARD = (4, 16, 64, 256)
+PREDICTED_PER_SHARD = (4, 32, 128, 256)
 SERVERS = ("gcs_server", "raylet")
 """Ray's own processes on the driver's machine."""
 
@@ -218,14 +220,14 @@ def predict(driver_ms: Line, start_s: Line, wish: Wish, per_shard: int) -> Predi
     """What the lines say.
 
     Args:
-        driver_ms: processor time of the driver, milliseconds a shard, by actors.
+        driver_ms: processor time of the driver, milliseconds a shard, by seconds a job.
         start_s: listing of a store, by shards.
         wish: for what.
         per_shard: rollouts a shard.
     """
     job_s = per_shard * wish.per_rollout / wish.interactions_per_s
     shards = -(-wish.interactions // (per_shard * wish.per_rollout))
-    rate, each_s = wish.actors / job_s, driver_ms(wish.actors) / 1e3
+    rate, each_s = wish.actors / job_s, driver_ms(job_s) / 1e3
     return Prediction(per_shard, job_s, shards, rate, rate * each_s, start_s(shards), int(job_s / each_s))
 
 
@@ -233,12 +235,15 @@ def predictions(fleets: Sequence[FleetPoint], stores: Sequence[StorePoint], wish
     """The lines through what was measured, and what they say of some sizes of shards."""
     guests = [point for point in fleets if point.kind == "guest"] or fleets
     # A slope below zero is noise, and would make the large look cheap.
-    driver_ms = Line.through((point.actors, point.driver_ms) for point in guests)
+    driver_ms = Line.through((point.job_s, point.driver_ms) for point in guests)
     if driver_ms.slope < 0:
         driver_ms = Line(max(point.driver_ms for point in guests), 0.0)
+    # An actor with a process has a connection of its own, which costs more than a share of one.
+    above = [point.driver_ms - driver_ms(point.job_s) for point in fleets if point.kind == "process"]
+    driver_ms = Line(driver_ms.at_zero + max(0.0, float(np.mean(above or [0.0]))), driver_ms.slope)
     start_s = Line.through((point.shards, point.start_s) for point in stores)
     return {
-        "driver_ms_by_actors": asdict(driver_ms),
+        "driver_ms_by_job_s": asdict(driver_ms),
         "start_s_by_shards": asdict(start_s),
         "predicted_for": asdict(wish),
         "predictions": [asdict(predict(driver_ms, start_s, wish, per_shard)) for per_shard in PREDICTED_PER_SHARD],

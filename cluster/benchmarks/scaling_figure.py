@@ -45,12 +45,11 @@ def _cost(axes: "Axes", result: dict[str, Any], before: dict[str, Any] | None) -
                 axes.plot(
                     x, y, mark, color=colour, label=label + words, fillstyle="full" if kind == "guest" else "none"
                 )
-    line, wish = Line(**result["driver_ms_by_actors"]), result["predicted_for"]
-    span = np.geomspace(10, wish["actors"], 50)
-    axes.plot(span, [line(each) for each in span], "-", color=NOW, alpha=0.6)
-    axes.plot(wish["actors"], line(wish["actors"]), "*", color="tab:red", ms=12, label=f"{wish['actors']:,} actors")
+    for each in result["predictions"]:
+        at = result["predicted_for"]["actors"], 1e3 * each["driver_load"] / each["shards_per_s"]
+        axes.plot(*at, "*", color="tab:red", ms=10)
     axes.set(xscale="log", yscale="log", xlabel="actors", ylabel="driver, processor ms a shard")
-    axes.set(title="Cost of a shard", ylim=(0.1, None))
+    axes.set(title="Cost of a shard (stars: predicted)", ylim=(0.1, None))
     axes.legend(fontsize="small")
 
 
@@ -70,10 +69,10 @@ def _memory(axes: "Axes", result: dict[str, Any]) -> None:
 
 
 def _load(axes: "Axes", result: dict[str, Any]) -> None:
-    line, wish = Line(**result["driver_ms_by_actors"]), result["predicted_for"]
+    wish = result["predicted_for"]
     x = np.geomspace(10, 10 * wish["actors"], 100)
     for each in result["predictions"]:
-        y = [actors / each["job_s"] * line(actors) / 1e3 for actors in x]
+        y = x * each["driver_load"] / wish["actors"]
         axes.plot(x, y, label=f"{each['per_shard']} rollouts a shard, {each['job_s']:.3g} s a job")
     axes.axhline(1, color="black", lw=0.8)
     axes.axvline(wish["actors"], color="tab:red", lw=0.8, ls=":")
