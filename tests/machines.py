@@ -48,7 +48,7 @@ class Machine:
     started: "list[subprocess.Popen[bytes]]" = field(default_factory=list)
 
     def start(self, *command: str, log: Path) -> "subprocess.Popen[bytes]":
-        """Start a process there; it leaves what it prints in a file."""
+        """Start a process there, in the folder of the file that gets what it prints."""
         with log.open("ab") as file:
             process = subprocess.Popen(
                 ["ip", "netns", "exec", self.name, *command],
@@ -56,7 +56,7 @@ class Machine:
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=file,
-                start_new_session=True,
+                cwd=log.parent,
             )
         self.started.append(process)
         return process
