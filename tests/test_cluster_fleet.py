@@ -39,13 +39,12 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Fleet, Pa
 
 
 @pytest.fixture
-def ray_fleet(shared: tuple[Fleet, Path], tmp_path: Path) -> Iterator[Fleet]:
+def ray_fleet(shared: tuple[Fleet, Path], tmp_path: Path) -> Fleet:
     fleet, link = shared
     link.unlink(missing_ok=True)
     link.symlink_to(tmp_path)
     fleet.restarts = 0
-    yield fleet
-    assert Underway(link.parent / "underway").sweep() == 0, "processes that ended have left something"
+    return fleet
 
 
 @pytest.fixture(params=["serial", "ray"])
@@ -167,7 +166,11 @@ def test_a_replaced_actor_pulls_the_weights_itself(ray_fleet: Fleet, tmp_path: P
     assert len(done) == 6
 
 
-def test_a_rollout_that_crashes_costs_itself_alone(ray_fleet: Fleet, tmp_path: Path) -> None:
+def test_a_rollout_that_crashes_costs_itself_alone(
+    ray_fleet: Fleet, shared: tuple[Fleet, Path], tmp_path: Path
+) -> None:
+    underway = Underway(shared[1].parent / "underway")
+    underway.sweep()
     (tmp_path / "crash-2").write_text("99")
     wide = missing_jobs("random-v0", 8, [], 4)
     done: list[FakeReceipt] = []
@@ -179,6 +182,7 @@ def test_a_rollout_that_crashes_costs_itself_alone(ray_fleet: Fleet, tmp_path: P
     assert re.fullmatch(
         r"Segmentation fault, in string_at \(.*\) of _misbehave \(fake_worker.py:\d+\) \(3 times\)", reason
     )
+    assert underway.sweep() == 0, "processes that crashed have left something"
 
 
 def test_a_rollout_that_hangs_is_ended_with_a_traceback(ray_fleet: Fleet, tmp_path: Path) -> None:
