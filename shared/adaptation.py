@@ -98,13 +98,13 @@ class Adapter:
     ) -> Float32:
         """A_I: the AAP actionability of every point after a history, [N], in [0, 1]."""
         everywhere = np.arange(len(observation.points))
-        features, places = self.features(observation, module, everywhere), self.places(observation, everywhere)
+        features, places = self.seen(observation, module, everywhere), self.places(observation, everywhere)
         return self._adaptive(module).actionability(features, places, self.z(history, module)).numpy()
 
     @torch.inference_mode()
     def prior_affordance(self, observation: Observation) -> Float32:
         """A: Where2Act's actionability of every point, [N], in [0, 1]."""
-        features = self.features(observation, "prior", np.arange(len(observation.points)))
+        features = self.seen(observation, "prior", np.arange(len(observation.points)))
         return self.policy.prior.actionability(features).numpy()
 
     @torch.inference_mode()
@@ -132,9 +132,15 @@ class Adapter:
 
     @torch.inference_mode()
     def features(self, observation: Observation, module: EncoderName, points: NDArray[np.int64]) -> Tensor:
-        """f_p|O of a module at points of a cloud, [len(points), feature_width]."""
+        """All that a module knows of points where actions are judged, [len(points), point_width]."""
         index = torch.from_numpy(points)
         return self._encoder(module).at(self.encode(observation, module), torch.zeros_like(index), index)
+
+    @torch.inference_mode()
+    def seen(self, observation: Observation, module: EncoderName, points: NDArray[np.int64]) -> Tensor:
+        """f_p|O of a module at points of a cloud, [len(points), feature_width]; cheaper, and enough without actions."""
+        index = torch.from_numpy(points)
+        return self._encoder(module).features_at(self.encode(observation, module), torch.zeros_like(index), index)
 
     def places(self, observation: Observation, points: NDArray[np.int64]) -> Tensor:
         """Places as actions are told them: p less the middle of what may be moved, [len(points), 3]."""
@@ -145,7 +151,7 @@ class Adapter:
     def proposals(self, observation: Observation, point: int, rng: np.random.Generator) -> Proposals:
         """Rotations at a point, from the prior's Action Proposal Network."""
         noise = rng.standard_normal((PROPOSALS, self.policy.config.noise_width)).astype(np.float32)
-        features = self.features(observation, "prior", np.array([point]))
+        features = self.seen(observation, "prior", np.array([point]))
         return Proposals(point, self.policy.prior.propose(features, torch.from_numpy(noise)))
 
     @torch.inference_mode()
@@ -178,8 +184,8 @@ class Adapter:
     def information(self, observation: Observation, points: NDArray[np.int64], latent: Tensor) -> Float32:
         """The AIP actionability a^AIP_p|z of the points at the indices `points`, [len(points)]."""
         places = self.places(observation, points)
-        expected = self.policy.aap.actionability(self.features(observation, "aap", points), places, latent)
-        features = self.features(observation, "aip", points)
+        expected = self.policy.aap.actionability(self.seen(observation, "aap", points), places, latent)
+        features = self.seen(observation, "aip", points)
         return self.policy.aip.actionability(features, latent, expected).numpy()
 
     def _entry(self, observation: Observation) -> _Entry:

@@ -9,10 +9,11 @@ from pydantic import ValidationError
 
 from shared.grouping import group_cloud
 from shared.networks.aap import Aap
-from shared.networks.actions import MOMENT_SCALE, action_inputs, geodesic_distance, orthonormal_frames
+from shared.networks.actions import MOMENT_SCALE, action_inputs, geodesic_distance, in_gripper, orthonormal_frames
 from shared.networks.configuration import NETWORKS, NetworkConfig
-from shared.networks.layers import Head
-from shared.networks.pointnet2 import CloudBatch, PointNet2
+from shared.networks.layers import Head, point_features
+from shared.networks.pointnet2 import CloudBatch, PointNet2, surroundings
+from shared.networks.prior import Prior
 
 TINY = NetworkConfig(
     centres=(24, 8),
@@ -22,6 +23,7 @@ TINY = NetworkConfig(
     propagation=((16,), (16, 16)),
     feature_width=16,
     latent_width=12,
+    surroundings=5,
 )
 
 
@@ -112,10 +114,44 @@ def test_action_features_hold_the_moment() -> None:
     assert torch.equal(action_inputs(point, frame, plain), frame)
 
 
+def test_surroundings_are_the_nearest_points_and_turn_with_the_gripper() -> None:
+    batch = clouds(2, points=40)
+    cloud, point = torch.tensor([0, 1, 1]), torch.tensor([3, 3, 7])
+    centres = batch.points[cloud, point]
+    offsets = surroundings(batch.points, cloud, centres, 6)
+    assert torch.equal(offsets[:, 0], torch.zeros(3, 3))
+    for found, which, centre in zip(offsets, cloud, centres, strict=True):
+        distances = (batch.points[which] - centre).norm(dim=-1).sort().values
+        torch.testing.assert_close(found.norm(dim=-1), distances[:6])
+    frames, turn = orthonormal_frames(torch.randn(3, 6)), torch.linalg.qr(torch.randn(3, 3)).Q
+    turn = turn * torch.linalg.det(turn)
+    turned = torch.cat([frames[:, :3] @ turn.T, frames[:, 3:] @ turn.T], dim=-1)
+    torch.testing.assert_close(in_gripper(offsets @ turn.T, turned), in_gripper(offsets, frames))
+    # A point ahead along the approach comes last of the three, one along forward first.
+    ahead = in_gripper(torch.stack([frames[:, :3], frames[:, 3:]], dim=1), frames)
+    torch.testing.assert_close(ahead, torch.tensor([[0.0, 0, 1], [1, 0, 0]]).expand(3, 2, 3), atol=1e-5, rtol=0)
+    assert surroundings(batch.points[:, :4], cloud, batch.points[cloud, 0], 6).shape == (3, 6, 3)
+
+
+def test_actions_are_told_what_lies_around_and_nobody_else_is() -> None:
+    module, batch = Prior(TINY), clouds(1)
+    cloud, point = torch.zeros(3, dtype=torch.long), torch.arange(3)
+    encoded = module.encoder(batch)
+    known = module.encoder.at(encoded, cloud, point)
+    alone = module.encoder.features_at(encoded, cloud, point)
+    assert known.shape == (3, TINY.point_width)
+    assert torch.equal(point_features(known, TINY), alone)
+    assert torch.equal(module.actionability(known), module.actionability(alone))
+    frames = orthonormal_frames(torch.randn(3, 6))
+    elsewhere = torch.cat([alone, torch.rand(3, 3 * TINY.surroundings)], dim=-1)
+    scores = [module.action_logits(features, batch.points[0, :3], frames) for features in (known, elsewhere)]
+    assert not torch.allclose(*scores)
+
+
 def codes(module: Aap, count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     draw = torch.Generator().manual_seed(seed)
     frames = orthonormal_frames(torch.randn(count, 6, generator=draw))
-    features, points = torch.randn(count, 16, generator=draw), torch.randn(count, 3, generator=draw)
+    features, points = torch.randn(count, TINY.point_width, generator=draw), torch.randn(count, 3, generator=draw)
     motions = torch.rand(count, generator=draw)
     return module.interaction_codes(features, points, frames, motions, (motions > 0.5).float())
 

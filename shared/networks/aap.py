@@ -4,9 +4,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shared.networks.actions import PLACE_SCALE, action_inputs, action_width, outcome_inputs, outcome_width
+from shared.networks.actions import PLACE_SCALE, outcome_inputs, outcome_width
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import Head, VectorEncoder
+from shared.networks.layers import ActionEncoder, Head, VectorEncoder, point_features
 from shared.networks.pointnet2 import PointNet2
 
 MIN_ATTENTION = 1e-4
@@ -27,7 +27,7 @@ class Aap(nn.Module):
         width, latent = config.feature_width, config.latent_width
         self.config = config
         self.encoder = PointNet2(config)
-        self.action_encoder = VectorEncoder(action_width(config), config)
+        self.action_encoder = ActionEncoder(config)
         self.outcome_encoder = VectorEncoder(outcome_width(config), config)
         self.code_head = Head((width, width, width), latent, config, product=config.products)
         self.attention_head = Head((width, width, width), 1, config)
@@ -46,7 +46,7 @@ class Aap(nn.Module):
         Deviation: the paper's w is any real number, so that its sum may be zero; here it is positive (softplus).
 
         Args:
-            features: f_p|O at each interaction's point, [..., feature_width].
+            features: of each interaction's point, [..., point_width].
             points: p less the middle of what may be moved, [..., 3].
             frames: approach and forward, [..., 6].
             motions: m, [...].
@@ -55,7 +55,8 @@ class Aap(nn.Module):
         Returns:
             Codes [..., latent_width] and attention weights [...].
         """
-        actions = self.action_encoder(action_inputs(points, frames, self.config))
+        actions = self.action_encoder(features, points, frames)
+        features = point_features(features, self.config)
         outcomes = self.outcome_encoder(outcome_inputs(motions, successes, self.config))
         weights = functional.softplus(self.attention_head(features, actions, outcomes)).squeeze(-1) + MIN_ATTENTION
         codes: Tensor = self.code_head(features, actions, outcomes)
@@ -91,15 +92,15 @@ class Aap(nn.Module):
         """Logits of the AAP action score s_u|z (AdaAfford, Adaptive Critic Network), [...].
 
         Args:
-            features: f_p|O, [..., feature_width].
+            features: of points, [..., point_width].
             points: p less the middle of what may be moved, [..., 3].
             frames: approach and forward, [..., 6].
             latents: z, [..., latent_width].
 
         The leading axes of features, frames and latents broadcast.
         """
-        actions = self.action_encoder(action_inputs(points, frames, self.config))
-        logits: Tensor = self.critic_head(features, actions, latents)
+        actions = self.action_encoder(features, points, frames)
+        logits: Tensor = self.critic_head(point_features(features, self.config), actions, latents)
         return logits.squeeze(-1)
 
     def actionability(self, features: Tensor, points: Tensor, latents: Tensor) -> Tensor:
@@ -107,7 +108,7 @@ class Aap(nn.Module):
 
         Deviation: where actions enter with p, D is told p too, since what its critic scores turns on lever arms.
         """
-        inputs = [features.detach(), latents.detach()]
+        inputs = [point_features(features, self.config).detach(), latents.detach()]
         if self.place_encoder is not None:
             inputs.insert(1, self.place_encoder(PLACE_SCALE * points))
         logits: Tensor = self.affordance_head(*inputs)

@@ -44,6 +44,13 @@ def action_inputs(points: Tensor, frames: Tensor, config: NetworkConfig) -> Tens
     return torch.cat([frames, PLACE_SCALE * places, MOMENT_SCALE * moments], dim=-1)
 
 
+def in_gripper(offsets: Tensor, frames: Tensor) -> Tensor:
+    """Offsets [..., k, 3] from p as a gripper at p has them, (forward, across, approach); leading axes broadcast."""
+    approach, forward, across = _columns(frames)
+    axes = torch.stack([forward, across, approach], dim=-1)
+    return offsets @ axes
+
+
 def middle_of(points: Tensor, movable: Tensor) -> Tensor:
     """The mean of a cloud's movable points, [..., 3]; of all of them where none is.
 

@@ -2,9 +2,8 @@
 
 from torch import Tensor, nn
 
-from shared.networks.actions import action_inputs, action_width
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import Head, VectorEncoder
+from shared.networks.layers import ActionEncoder, Head, VectorEncoder, point_features
 from shared.networks.pointnet2 import PointNet2
 
 SCORE_SCALE = 0.02
@@ -23,7 +22,7 @@ class Aip(nn.Module):
         width, latent = config.feature_width, config.latent_width
         self.config = config
         self.encoder = PointNet2(config)
-        self.action_encoder = VectorEncoder(action_width(config), config)
+        self.action_encoder = ActionEncoder(config)
         self.score_encoder = VectorEncoder(1, config)
         self.actionability_encoder = VectorEncoder(1, config)
         self.critic_head = Head((width, width, width, latent), 1, config, product=config.products)
@@ -35,13 +34,14 @@ class Aip(nn.Module):
         """AIP action scores s^AIP_u|z (AdaAfford, AIP Critic Network), [...], in nats of the AAP loss.
 
         Args:
-            features: f_p|O of this module, [..., feature_width].
+            features: of points under this module's encoder, [..., point_width].
             points: p less the middle of what may be moved, [..., 3].
             frames: approach and forward, [..., 6].
             latents: z, [..., latent_width].
             aap_scores: s^AAP_u|z, probabilities, [...].
         """
-        actions = self.action_encoder(action_inputs(points, frames, self.config))
+        actions = self.action_encoder(features, points, frames)
+        features = point_features(features, self.config)
         scores: Tensor = self.critic_head(features, self.score_encoder(aap_scores[..., None]), actions, latents)
         return SCORE_SCALE * scores.squeeze(-1)
 
@@ -49,10 +49,10 @@ class Aip(nn.Module):
         """AIP actionability a^AIP_p|z of points (AdaAfford, AIP Affordance Network), [...].
 
         Args:
-            features: f_p|O of this module, [..., feature_width].
+            features: of points under this module's encoder, [..., point_width].
             latents: z, [..., latent_width].
             aap_actionability: a^AAP_p|z in [0, 1], [...].
         """
         encoded = self.actionability_encoder(aap_actionability[..., None])
-        scores: Tensor = self.affordance_head(features.detach(), encoded, latents)
+        scores: Tensor = self.affordance_head(point_features(features, self.config).detach(), encoded, latents)
         return SCORE_SCALE * scores.squeeze(-1)

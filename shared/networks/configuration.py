@@ -36,6 +36,9 @@ class NetworkConfig(StrictModel):
     """Of the Gaussian that the proposal network turns into rotations."""
     action_features: bool = True
     """Whether an action enters with p and p x d, beside approach and forward. As published: not."""
+    surroundings: int = Field(32, ge=0, le=128)
+    """How many points of the cloud around p an action is told, in the gripper's own frame, beside what the point
+    encoder makes of them: whether fingers will close on an edge shows there. As published: 0."""
     outcome_features: bool = True
     """Whether an outcome enters with log(1 + m / tau) and r, beside the motion m. As published: not."""
     products: bool = True
@@ -43,6 +46,11 @@ class NetworkConfig(StrictModel):
     `shared.networks.layers.Head`). As published: not."""
     evidence: bool = True
     """Whether z is told how much was tried, beside the mean of what the tries say. As published: not."""
+
+    @property
+    def point_width(self) -> int:
+        """Of all that is known of a point: f_p|O, then the offsets of its surroundings (see `PointNet2.at`)."""
+        return self.feature_width + 3 * self.surroundings
 
     @model_validator(mode="after")
     def _consistent(self) -> "NetworkConfig":
@@ -66,6 +74,7 @@ NETWORKS = {
         propagation=((256, 256), (256, 256), (256, 128), (128, 128, 128)),
         normalisation="batch",
         action_features=False,
+        surroundings=0,
         outcome_features=False,
         products=False,
         evidence=False,

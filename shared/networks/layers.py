@@ -6,7 +6,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from shared.networks.actions import action_inputs, action_width, in_gripper
 from shared.networks.configuration import NetworkConfig
+
+SURROUNDINGS_SCALE = 10.0
+"""Offsets of the nearest points, some hundredths of a unit, come to some tenths."""
 
 
 class Normalisation(nn.Module):
@@ -53,6 +57,42 @@ class VectorEncoder(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[..., width_in] to [..., feature_width]."""
         return _as_tensor(self.second(functional.leaky_relu(self.first(x))))
+
+
+class ActionEncoder(nn.Module):
+    """Encodes an action at a point into f_a (AdaAfford, Input Encoders).
+
+    Deviation, where `config.surroundings` is set: the points around p are told as the gripper sees them, in its own
+    frame, each through a small perceptron, of which the maximum counts, as in PointNet.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.numbers = VectorEncoder(action_width(config), config)
+        self.each = PointwiseMlp(3, (32, 64), "none") if config.surroundings else None
+        self.together = VectorEncoder(64, config) if config.surroundings else None
+
+    def forward(self, features: Tensor, points: Tensor, frames: Tensor) -> Tensor:
+        """Actions to [..., feature_width]; leading axes broadcast.
+
+        Args:
+            features: all that is known of the points, [..., point_width].
+            points: p less the middle of what may be moved, [..., 3].
+            frames: approach and forward, [..., 6].
+        """
+        encoded = _as_tensor(self.numbers(action_inputs(points, frames, self.config)))
+        if self.each is None or self.together is None:
+            return encoded
+        around = features[..., self.config.feature_width :]
+        offsets = around.reshape(*around.shape[:-1], self.config.surroundings, 3)
+        seen = SURROUNDINGS_SCALE * in_gripper(offsets, frames)
+        return encoded + _as_tensor(self.together(self.each(seen).amax(dim=-2)))
+
+
+def point_features(features: Tensor, config: NetworkConfig) -> Tensor:
+    """f_p|O alone, [..., feature_width], of all that is known of points, [..., point_width]."""
+    return features[..., : config.feature_width]
 
 
 class Head(nn.Module):

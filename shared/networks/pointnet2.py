@@ -16,6 +16,8 @@ from shared.networks.configuration import NetworkConfig
 from shared.networks.layers import Normalisation, PointwiseMlp
 from shared.vocabulary import Float32
 
+_QUERIES = 256
+"""Points whose surroundings are sought at once; bounds memory."""
 MIN_SQUARED_DISTANCE = 1e-8
 """Keeps the inverse-distance weights of a point finite at a centre."""
 
@@ -84,7 +86,8 @@ class PointNet2(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.width = config.feature_width
+        self.width = config.point_width
+        self.surroundings = config.surroundings
         widths = [3]
         self.abstractions = nn.ModuleList()
         for layer_widths in config.abstraction:
@@ -110,7 +113,7 @@ class PointNet2(nn.Module):
             coarse = propagation(torch.cat([spread, features.pop()], dim=-1))
         return EncodedClouds(clouds, coarse)
 
-    def at(self, encoded: EncodedClouds, cloud: Tensor, point: Tensor) -> Tensor:
+    def features_at(self, encoded: EncodedClouds, cloud: Tensor, point: Tensor) -> Tensor:
         """Features f_p|O of single points, [Q, C].
 
         Args:
@@ -128,6 +131,38 @@ class PointNet2(nn.Module):
         result = self.propagations[-1](torch.cat([spread, xyz], dim=-1))
         assert isinstance(result, Tensor)
         return result
+
+    def at(self, encoded: EncodedClouds, cloud: Tensor, point: Tensor) -> Tensor:
+        """All that is known of single points where actions are judged, [Q, width]: f_p|O, then what lies around.
+
+        Offsets of the nearest points, [Q, 3 * surroundings], follow the features in one tensor, so that whoever keeps
+        or hands on the one has the other; `ActionEncoder` and `point_features` take them apart.
+        """
+        features = self.features_at(encoded, cloud, point)
+        if not self.surroundings:
+            return features
+        points = encoded.clouds.points
+        around = surroundings(points, cloud, points[cloud, point], self.surroundings)
+        return torch.cat([features, around.flatten(-2)], dim=-1)
+
+
+def surroundings(points: Tensor, cloud: Tensor, centres: Tensor, count: int) -> Tensor:
+    """Offsets of the nearest points of each cloud, [Q, count, 3]; a cloud with fewer points repeats its farthest one.
+
+    Args:
+        points: [B, N, 3].
+        cloud: [Q], which cloud.
+        centres: [Q, 3], in it.
+        count: how many.
+    """
+    found = []
+    for first in range(0, len(cloud), _QUERIES):
+        here = slice(first, first + _QUERIES)
+        offsets = points[cloud[here]] - centres[here, None]
+        nearest = offsets.square().sum(dim=-1).topk(min(count, points.shape[1]), dim=-1, largest=False).indices
+        found.append(offsets.gather(1, nearest[..., None].expand(-1, -1, 3)))
+    near = torch.cat(found) if found else centres.new_zeros(0, min(count, points.shape[1]), 3)
+    return torch.cat([near, near[:, -1:].expand(-1, count - near.shape[1], 3)], dim=1)
 
 
 class SetAbstraction(nn.Module):

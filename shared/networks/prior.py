@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from shared.networks.actions import FRAME_WIDTH, action_inputs, action_width, orthonormal_frames
+from shared.networks.actions import FRAME_WIDTH, orthonormal_frames
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import Head, VectorEncoder
+from shared.networks.layers import ActionEncoder, Head, point_features
 from shared.networks.pointnet2 import PointNet2
 
 
@@ -21,7 +21,7 @@ class Prior(nn.Module):
         width = config.feature_width
         self.config = config
         self.encoder = PointNet2(config)
-        self.action_encoder = VectorEncoder(action_width(config), config)
+        self.action_encoder = ActionEncoder(config)
         self.proposal_head = Head((width, config.noise_width), FRAME_WIDTH, config)
         self.critic_head = Head((width, width), 1, config)
         self.affordance_head = Head((width,), 1, config)
@@ -30,28 +30,28 @@ class Prior(nn.Module):
         """Rotations at points (Where2Act, Action Proposal Network).
 
         Args:
-            features: f_p|O, [..., 1, feature_width].
+            features: of points, [..., 1, point_width].
             noise: standard normal, [..., S, noise_width].
 
         Returns:
             Approach and forward of S rotations a point, [..., S, 6].
         """
-        return orthonormal_frames(self.proposal_head(features, noise))
+        return orthonormal_frames(self.proposal_head(point_features(features, self.config), noise))
 
     def action_logits(self, features: Tensor, points: Tensor, frames: Tensor) -> Tensor:
         """Logits of the action score s_u (Where2Act, Action Scoring Network), [...]; `torch.sigmoid` gives the score.
 
         Args:
-            features: f_p|O, [..., feature_width], broadcast against the frames.
+            features: of points, [..., point_width], broadcast against the frames.
             points: p less the middle of what may be moved, [..., 3], broadcast against the frames.
             frames: approach and forward, [..., 6].
         """
-        actions = self.action_encoder(action_inputs(points, frames, self.config))
-        return _single(self.critic_head(features, actions))
+        actions = self.action_encoder(features, points, frames)
+        return _single(self.critic_head(point_features(features, self.config), actions))
 
     def actionability(self, features: Tensor) -> Tensor:
-        """Actionability a_p in [0, 1] of points with features [..., feature_width] (Where2Act), [...]."""
-        return torch.sigmoid(_single(self.affordance_head(features)))
+        """Actionability a_p in [0, 1] of points with features [..., point_width] (Where2Act), [...]."""
+        return torch.sigmoid(_single(self.affordance_head(point_features(features, self.config))))
 
 
 def _single(x: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from shared.networks.actions import PLACE_SCALE
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import Head, VectorEncoder
+from shared.networks.layers import Head, VectorEncoder, point_features
 
 FIRST_LOGIT = -2.0
 """Of a similarity under untrained weights: about 0.1, so that training begins near the prior."""
@@ -32,14 +32,14 @@ class Where2ActAdaptation(nn.Module):
         """sim_pq of tried points p and points q that are asked about, [...].
 
         Args:
-            tried: Where2Act's f_p, [..., feature_width].
-            asked: Where2Act's f_q, [..., feature_width].
+            tried: of Where2Act, at p, [..., point_width].
+            asked: of Where2Act, at q, [..., point_width].
             distances: |p - q|, [...].
 
         The leading axes broadcast.
         """
         far = self.distance_encoder(PLACE_SCALE * distances[..., None])
-        logits: Tensor = self.similarity_head(tried, asked, far)
+        logits: Tensor = self.similarity_head(*(point_features(x, self.config) for x in (tried, asked)), far)
         return torch.sigmoid(logits.squeeze(-1) + FIRST_LOGIT)
 
 
