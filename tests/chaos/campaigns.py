@@ -33,14 +33,14 @@ TRAINING, BESIDE, WHOLE = "train, all stages", "learn beside collect, in rounds"
 
 KILLS = {
     SERIAL_DISK: 60,
-    SERIAL_BUCKET: 30,
-    SESSION_DISK: 10,
-    SESSION_BUCKET: 5,
-    CLUSTER_DISK: 30,
+    SERIAL_BUCKET: 40,
+    SESSION_DISK: 6,
+    SESSION_BUCKET: 4,
+    CLUSTER_DISK: 24,
     CLUSTER_BUCKET: 10,
-    TRAINING: 46,
-    BESIDE: 10,
-    WHOLE: 6,
+    TRAINING: 48,
+    BESIDE: 7,
+    WHOLE: 4,
 }
 assert sum(KILLS.values()) >= 200, "this is what is promised"
 
