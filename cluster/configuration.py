@@ -9,7 +9,7 @@ from collector.guard import Limits
 from learner.configuration import AapConfig, AdaptationConfig, AipConfig, InteractionConfig, PriorConfig
 from shared.configuration import CollectionConfig, StrictModel
 from shared.networks.configuration import NetworkConfig
-from shared.plan import EvaluationConfig
+from shared.plan import ROLLOUTS_PER_SHARD, EvaluationConfig
 
 EXECUTION_SETTINGS = frozenset({"workers", "ray_address", "rollout_limit_s", "memory_limit_mb"})
 """Settings that do not change what a run produces; they may differ from one attempt to the next."""
@@ -24,7 +24,7 @@ class RolloutCounts(StrictModel):
     """In each later round, proposed by AIP."""
     evaluation: int = Field(8, ge=1)
     """On test objects, which are not trained on."""
-    per_shard: int = Field(4, ge=1, le=4096)
+    per_shard: int = Field(ROLLOUTS_PER_SHARD, ge=1, le=4096)
     """A job's size: what a worker does in one go, and what a kill can cost."""
     per_object: bool = False
     """Whether the first three are counted for each object, instead of all in all. As published: 4 draws of 32

@@ -23,6 +23,8 @@ class ObjectRef(StrictModel):
     content_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
+ROLLOUTS_PER_SHARD = 8
+"""Unless told otherwise: some seconds' work, which is what a kill can cost, of which the commit takes a few percent."""
 Budget = Annotated[int, Field(ge=1, le=64)]
 """A number of tries."""
 

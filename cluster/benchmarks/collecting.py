@@ -19,13 +19,11 @@ from collector.partnet import URDF_FILE
 from collector.published import PublishedRequest, PublishedTiming
 from collector.worker import Worker
 from shared.errors import UsageError, WorkerError
-from shared.plan import Job, Plan, missing_jobs
+from shared.plan import ROLLOUTS_PER_SHARD, Job, Plan, missing_jobs
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store, info
 
 STAGES = ("load", "settle", "observe", "propose", "simulate", "write")
-ROLLOUTS_PER_SHARD = 2
-"""As `adaafford collect` does by default."""
 PUBLISHED_LIMIT_S = 600.0
 
 

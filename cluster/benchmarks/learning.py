@@ -150,8 +150,8 @@ def stages_of(dataset: Dataset, parts: Split, config: LearnerConfig) -> list[tup
 class StepApart:
     """Training steps of a stage with a clock between their parts.
 
-    Sampling ends where the stage first asks its encoder or, where it has inherited one, for gains or codes. Features are
-    handed on as new leaves: the first backward pass ends at them, the second goes on through the encoder.
+    Sampling ends where the stage first asks its encoder or, where it has inherited one, for gains or codes. Features
+    are handed on as new leaves: the first backward pass ends at them, the second goes on through the encoder.
     """
 
     def __init__(self, stage: Stage) -> None:

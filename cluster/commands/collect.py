@@ -12,6 +12,7 @@ from cluster.selection import ObjectSelection
 from cluster.settings import early_flags, layered, parse_flags
 from shared.configuration import CollectionConfig
 from shared.errors import UsageError
+from shared.plan import ROLLOUTS_PER_SHARD
 from shared.tasks import task_named
 
 
@@ -26,7 +27,7 @@ class CollectSettings(ObjectSelection):
     per_version: int | None = Field(None, ge=1)
     """With --policy latest: rollouts that one version proposes at the most; then the next one is waited for (rounds).
     Without it, each version proposes until there is a newer one (continuous collection)."""
-    per_shard: int = Field(4, ge=1, le=4096)
+    per_shard: int = Field(ROLLOUTS_PER_SHARD, ge=1, le=4096)
     """Rollouts a shard."""
     seed: int = Field(1, ge=0, lt=2**63)
     """Everything random derives from it."""
