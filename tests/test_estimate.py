@@ -47,7 +47,7 @@ def test_cost_grows_with_what_is_asked_for() -> None:
     def of(**changes: object) -> Estimate:
         return estimate(CampaignConfig.model_validate({"task": "push", **changes}))
 
-    once, twice = of(rollouts={"random": 100}), of(rollouts={"random": 200})
+    once, twice = of(rollouts={"random": 80}), of(rollouts={"random": 160})
     assert stage(twice, "collect-random").core_s == pytest.approx(2 * stage(once, "collect-random").core_s)
     assert stage(twice, "collect-random").size_bytes == pytest.approx(2 * stage(once, "collect-random").size_bytes)
     exact = of(collection={"fidelity": {"name": "reference"}})
@@ -82,7 +82,7 @@ def test_a_dry_run_writes_nothing(
     assert adaafford(["run", "--dry-run", "--preset", "laptop", "--out", "run"]) == 0
     out = capsys.readouterr().out
     assert "collect-random" in out
-    assert "19,200" in out
+    assert "48,000" in out
     assert "measured" in out
     assert list(tmp_path.iterdir()) == []
 
