@@ -232,7 +232,8 @@ def test_damaged_weights_are_refused_in_one_line(
     elif damage == "older":
         document.write_text(document.read_text().replace('"schema_version": 1', '"schema_version": 0'))
     else:
-        tensors = load_file(weights)
+        # Copies, since what is loaded lies in the file that is about to be overwritten.
+        tensors = {name: tensor.clone() for name, tensor in load_file(weights).items()}
         next(iter(tensors.values())).fill_(torch.nan)
         save_file(tensors, weights) if damage == "not finite" else torch.save(tensors, weights)
         told = json.loads(document.read_text())
