@@ -22,7 +22,7 @@ class CurveRow:
 
     Attributes:
         name: of the training.
-        run: which of its runs; "" for all of them together.
+        run: the place of its run among those of the name, from "1"; "" for all of them together.
         critic: whose answers, and how its tries were chosen.
         tries: how many.
         f_score: at the threshold 0.5, with its 95% interval over objects.

@@ -104,7 +104,7 @@ def _print_learner(result: dict[str, Any]) -> None:
     port = result["straightforward_port_interactions_per_second"]
     print(f"{result['repeats']} times {result['steps']} steps, {result['threads']} threads; medians")
     for name, parts in result["step_seconds"].items():
-        rate = result[f"{name}_interactions_per_second"]
+        rate = result[f"{name.replace('-', '_')}_interactions_per_second"]
         print(f"  {name:<6}{rate:>9,.0f} interactions/s; ms a step: ", end="")
         print(", ".join(f"{part} {1e3 * seconds:.1f}" for part, seconds in parts.items()))
     print(f"  port  {port:>9.2f} interactions/s at {result['port_points']:,} points each")

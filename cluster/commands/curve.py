@@ -108,7 +108,7 @@ def _judge(command: CurveCommand, runs: dict[str, list[Path]]) -> "Curves":
             others = [all_[place].oracle for all_ in trained.values() if place < len(all_)]
             oracle = next((path for path in [run.oracle, *others] if path is not None), None)
             answered, gained = _answers(dataset, candidates, policy, oracle, command.tries, gains=name not in gains)
-            answers.append((runs[name][place].name, answered))
+            answers.append((str(place + 1), answered))
             if gained:
                 gains[name] = gained
             print(f"judged {runs[name][place]}", flush=True)
