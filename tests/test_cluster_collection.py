@@ -164,7 +164,7 @@ def test_every_policy_is_published_before_it_is_used(tmp_path: Path, alternation
 SMALL = {
     "rollouts": {"random": 10, "aip": 2, "evaluation": 2},
     "procedural": {"per_category": 6},
-    "learner": {name: {"steps": 3} for name in ("prior", "aap", "aip")},
+    "learner": {"prior": {"steps": 3}, "aap": {"steps": 3, "oracle_steps": 3}, "aip": {"steps": 3}},
 }
 
 
