@@ -161,10 +161,11 @@ def test_every_policy_is_published_before_it_is_used(tmp_path: Path, alternation
         assert [names.index(name) for name in order] == sorted(names.index(name) for name in order)
 
 
+QUICK = {"steps": 3, "affordance": {"steps": 3}}
 SMALL = {
     "rollouts": {"random": 10, "aip": 2, "evaluation": 2},
     "procedural": {"per_category": 6},
-    "learner": {"prior": {"steps": 3}, "aap": {"steps": 3, "oracle_steps": 3}, "aip": {"steps": 3}},
+    "learner": {"prior": QUICK, "aap": {**QUICK, "oracle_steps": 3}, "aip": QUICK},
 }
 
 
