@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from cluster.evaluation_tables import as_csv
 from learner.comparison import CurveRow
 from learner.curve import ProposalGain
+from learner.training import without_nan
 from shared.files import write_atomically
 
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, FIGURE_FILE = "curve.json", "curve.csv", "curve.md", "curve.png"
@@ -53,7 +54,7 @@ class Curves:
 def write_curves(out: Path, curves: Curves) -> None:
     """Write the four files; curve.json comes last."""
     out.mkdir(parents=True, exist_ok=True)
-    rows = [_plain(asdict(row)) for row in curves.rows]
+    rows = [without_nan(asdict(row)) for row in curves.rows]
     write_atomically(out / CSV_FILE, as_csv(rows).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(curves).encode())
     draw_curves(curves, out / FIGURE_FILE)
@@ -63,8 +64,8 @@ def write_curves(out: Path, curves: Curves) -> None:
 def as_json(curves: Curves) -> dict[str, Any]:
     """All of it as JSON has it; null for no figure."""
     found = asdict(curves)
-    found["rows"] = [_plain(row) for row in found["rows"]]
-    found["gains"] = {name: [_plain(asdict(gain)) for gain in gains] for name, gains in curves.gains.items()}
+    found["rows"] = [without_nan(row) for row in found["rows"]]
+    found["gains"] = {name: [without_nan(asdict(gain)) for gain in gains] for name, gains in curves.gains.items()}
     return found
 
 
@@ -180,8 +181,3 @@ def _percent(value: float, low: float = math.nan, high: float = math.nan) -> str
     if math.isnan(value):
         return "-"
     return f"{100 * value:.1f}" + ("" if math.isnan(low) else f" [{100 * low:.1f}, {100 * high:.1f}]")
-
-
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """NaN as None."""
-    return {name: None if isinstance(v, float) and math.isnan(v) else v for name, v in values.items()}

@@ -39,7 +39,7 @@ class SeenRows:
     """Ordered rows as AAP sees them: tries and questions alike.
 
     Attributes:
-        features: f_p|O, [B, n, feature_width].
+        features: of the points, [B, n, point_width].
         xyz: p less the middle of what may be moved, [B, n, 3].
         frame: approach and forward, [B, n, 6].
         motion: m, [B, n].

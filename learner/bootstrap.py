@@ -6,7 +6,7 @@ Shapes: I rows, G groups (objects), B resamples.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from shared import seeds
 
@@ -41,3 +41,8 @@ def ratio_interval(above: ArrayLike, below: ArrayLike, groups: ArrayLike) -> tup
     tail = 50.0 * (1.0 - CONFIDENCE)
     low, high = np.percentile(sums[0][defined] / sums[1][defined], (tail, 100.0 - tail))
     return float(low), float(high)
+
+
+def f_score_interval(claimed: NDArray[np.bool_], labels: NDArray[np.bool_], groups: ArrayLike) -> tuple[float, float]:
+    """The interval of F1 = 2 TP / (claimed + true), [I] each; see `ratio_interval`."""
+    return ratio_interval(2.0 * (claimed & labels), 1.0 * claimed + labels, groups)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from learner.bootstrap import ratio_interval
+from learner.bootstrap import f_score_interval, ratio_interval
 from learner.curve import Answers, Asked, CriticKind
 from learner.metrics import THRESHOLD, cross_entropies, discrimination
 
@@ -90,8 +90,7 @@ def _row(
     groups: NDArray[np.int64],
 ) -> CurveRow:
     found = discrimination(scores, labels)
-    claimed = scores >= THRESHOLD
-    f_low, f_high = ratio_interval(2.0 * (claimed & labels), 1.0 * claimed + labels, groups)
+    f_low, f_high = f_score_interval(scores >= THRESHOLD, labels, groups)
     closed, closed_low, closed_high, from_none = (float("nan"),) * 4
     if _ORACLE in losses:
         gained, whole = losses[_PRIOR] - losses[asked], losses[_PRIOR] - losses[_ORACLE]

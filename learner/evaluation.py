@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.bootstrap import ratio_interval
+from learner.bootstrap import f_score_interval, ratio_interval
 from learner.critics import OracleScores, RowCritic, row_critic
 from learner.data import Dataset, load_dataset
 from learner.metrics import THRESHOLD, discrimination
@@ -177,8 +177,7 @@ class _Judge:
         labels = self.dataset.rows.success[asked].numpy()
         believed = torch.cat(scores).numpy()
         found = discrimination(believed, labels)
-        claimed, true = believed >= THRESHOLD, labels > THRESHOLD
-        f_low, f_high = ratio_interval(2.0 * (claimed & true), 1.0 * claimed + true, self._object_of[asked.numpy()])
+        f_low, f_high = f_score_interval(believed >= THRESHOLD, labels > THRESHOLD, self._object_of[asked.numpy()])
         chosen = self._exploits(method, budget)
         exploits = self.dataset.rows.success.numpy()[chosen].astype(np.float64)
         success_low, success_high = ratio_interval(exploits, np.ones(len(exploits)), self._object_of[chosen])

@@ -16,7 +16,7 @@ class FrozenPrior:
     """What a frozen Where2Act makes of every row.
 
     Attributes:
-        features: f_p|O, [I, feature_width].
+        features: of the points, [I, point_width].
         scores: s_u, [I].
         actionability: a_p of the touched points, [I].
     """
@@ -41,8 +41,8 @@ class FrozenAap:
 
     Attributes:
         aap: frozen.
-        features: f_p|O of the rows, [I, feature_width].
-        pool_features: f_p|O of the pool's points, [O, P, feature_width]; None where no pool was given.
+        features: of the rows' points, [I, point_width].
+        pool_features: of the pool's points, [O, P, point_width]; None where no pool was given.
         codes: z_I of the rows, [I, latent_width].
         weights: w_I of the rows, [I].
     """

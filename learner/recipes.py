@@ -108,7 +108,8 @@ class Recipe:
         trained, oracle = "aap" in self.policy.trained, self.oracle
         if config.training == "privileged" and not trained:
             oracle = self._oracle()
-        stage = AapStage(aap, self.dataset, self.parts, config, self._teacher(oracle), trained=trained)
+        teacher = self._teacher(oracle if config.training == "privileged" else None)
+        stage = AapStage(aap, self.dataset, self.parts, config, teacher, trained=trained)
         result = self.runner.train(stage, config, "aap")
         frozen = FrozenAap.of(aap, self.dataset, pool)
         affordance = AffordanceStage(
@@ -125,7 +126,8 @@ class Recipe:
     def _aip(self) -> TrainingResult:
         aip, config, pool = self.policy.aip.requires_grad_(True), self.config.aip, self._pool("aip")
         frozen = FrozenAap.of(self.policy.aap, self.dataset, pool)
-        stage = AipStage(aip, self.dataset, self.parts, config, frozen, self._teacher(self.oracle))
+        teacher = self._teacher(self.oracle if config.training == "inherited" else None)
+        stage = AipStage(aip, self.dataset, self.parts, config, frozen, teacher)
         result = self.runner.train(stage, config, "aip")
         aip.eval().requires_grad_(False)
         features = pool.features_under(aip.encoder, self.dataset.clouds)
@@ -169,7 +171,7 @@ class Recipe:
         return ProposalPool.of(self.dataset, self.policy.prior, generator(self.config.seed, f"learner.{stage}.pool"))
 
     def _teacher(self, oracle: OracleCritic | None) -> Teacher | None:
-        """What the oracle says of all rows; nobody teaches where the paper's way is asked for."""
+        """What the oracle says of all rows, whose clouds it has to encode for that; nothing where there is none."""
         return None if oracle is None else Teacher.of(oracle, self.dataset)
 
     def _oracle(self) -> OracleCritic:

@@ -140,7 +140,7 @@ class Batch:
         return cls(clouds, ordered.cloud, point, xyz, frame, motion, success, facts)
 
     def features(self, encoder: PointNet2) -> Tensor:
-        """f_p|O of the rows, [B, n, feature_width]; each cloud is encoded once."""
+        """What is known of the rows' points, [B, n, point_width]; each cloud is encoded once."""
         flat = encoder.at(encoder(self.clouds), self.cloud.flatten(), self.point.flatten())
         return flat.reshape(*self.point.shape, -1)
 
@@ -151,7 +151,7 @@ class ProposalPool:
 
     Attributes:
         point: [O, P], index in the cloud.
-        features: [O, P, feature_width], of the prior.
+        features: [O, P, point_width], of the prior.
         prior: whose proposal network draws.
     """
 
@@ -170,7 +170,7 @@ class ProposalPool:
         return cls(point, _features_of_all(prior.encoder, dataset.clouds, point), prior)
 
     def features_under(self, encoder: PointNet2, clouds: CloudBatch) -> Tensor:
-        """The points' features under another frozen encoder, [O, P, feature_width]."""
+        """The points' features under another frozen encoder, [O, P, point_width]."""
         return _features_of_all(encoder, clouds, self.point)
 
     @torch.no_grad()
@@ -182,7 +182,7 @@ class ProposalPool:
 
 @torch.no_grad()
 def frozen_features(encoder: PointNet2, clouds: CloudBatch, cloud: Tensor, point: Tensor) -> Tensor:
-    """Features of points under an encoder that is not trained, [Q, feature_width]; each cloud is encoded once.
+    """Features of points under an encoder that is not trained, [Q, point_width]; each cloud is encoded once.
 
     Args:
         encoder: in evaluation mode for the duration.
@@ -204,7 +204,7 @@ def frozen_features(encoder: PointNet2, clouds: CloudBatch, cloud: Tensor, point
 
 
 def _features_of_all(encoder: PointNet2, clouds: CloudBatch, point: Tensor) -> Tensor:
-    """Features of the same number of points of every cloud, [O, P] to [O, P, feature_width]."""
+    """Features of the same number of points of every cloud, [O, P] to [O, P, point_width]."""
     cloud = torch.arange(len(point))[:, None].expand_as(point)
     return frozen_features(encoder, clouds, cloud.flatten(), point.flatten()).reshape(*point.shape, -1)
 

@@ -9,22 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from collector.guard import UnderWay
+from collector.receipt import Receipt
 from shared.errors import StoreError
 from shared.plan import Job, Plan
-
-
-@dataclass(frozen=True, slots=True)
-class FakeReceipt:
-    """The fields of `collector.worker.Receipt`, whose module takes seconds to import in each actor."""
-
-    shard_id: str
-    rollouts: int
-    interactions: int
-    successes: int
-    outcomes: dict[str, int]
-    seconds: dict[str, float]
-    quarantined: int = 0
-    memory_mb: float = 100.0
 
 
 @dataclass
@@ -41,7 +28,7 @@ class FakeWorker:
         with (self.folder / f"pulled-{version}").open("a") as log:
             log.write(f"{os.getpid()}\n")
 
-    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> FakeReceipt:
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> Receipt:
         with (self.folder / "begun").open("a") as log:
             log.write(f"{job.shard_id} {os.getpid()}\n")
         if plan.policy_version:
@@ -54,7 +41,7 @@ class FakeWorker:
         for rollout, reason in quarantined.items():
             (self.folder / f"quarantined-{rollout}").write_text(reason)
         (self.folder / f"shard-{job.shard_id}").touch()
-        return FakeReceipt(
+        return Receipt(
             job.shard_id,
             job.stop - job.start,
             4 * len(executed),

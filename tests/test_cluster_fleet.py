@@ -21,11 +21,12 @@ from cluster.ray_fleet import RayFleet
 from cluster.seats import IN_FLIGHT
 from cluster.session import fleets
 from collector.guard import Limits
+from collector.receipt import Receipt
 from shared.configuration import CollectionConfig
 from shared.errors import StoreError
 from shared.plan import Job, ObjectRef, Plan, Setting, missing_jobs
 from shared.underway import Underway
-from tests.fake_worker import FakeReceipt, FakeWorker
+from tests.fake_worker import FakeWorker
 
 LIMITS = Limits(rollout_s=2.0, memory_mb=1000.0)
 
@@ -67,7 +68,7 @@ def jobs(count: int, key: str = "random-v0") -> list[Job]:
 
 
 def run(fleet: Fleet, count: int) -> list[str]:
-    receipts: list[FakeReceipt] = []
+    receipts: list[Receipt] = []
     fleet.run(Listed(plan(), jobs(count)), receipts.append)
     return sorted(receipt.shard_id for receipt in receipts)
 
@@ -130,7 +131,7 @@ class Slow(Listed):
 
 
 def test_orders_that_are_not_there_yet_are_asked_for_again(fleet: Fleet) -> None:
-    receipts: list[FakeReceipt] = []
+    receipts: list[Receipt] = []
     fleet.run(Slow(5), receipts.append)
     assert sorted(receipt.shard_id for receipt in receipts) == [job.shard_id for job in jobs(5)]
 
@@ -138,7 +139,7 @@ def test_orders_that_are_not_there_yet_are_asked_for_again(fleet: Fleet) -> None
 def test_orders_are_taken_no_earlier_than_somebody_is_free_for_them(fleet: Fleet) -> None:
     orders, done = Slow(12), 0
 
-    def count(receipt: FakeReceipt) -> None:
+    def count(receipt: Receipt) -> None:
         nonlocal done
         done += 1
         assert orders.taken <= done + 2 * fleet.workers
@@ -161,7 +162,7 @@ def test_weights_reach_the_live_workers_once_a_version(fleet: Fleet, tmp_path: P
 def test_a_replaced_actor_pulls_the_weights_itself(ray_fleet: Fleet, tmp_path: Path) -> None:
     ray_fleet.load_policy(1, {"weights.safetensors": b"weights 1"})
     (tmp_path / "die-2").write_text("1")
-    done: list[FakeReceipt] = []
+    done: list[Receipt] = []
     ray_fleet.run(Listed(plan("aip", 1), jobs(6, "aip-v1")), done.append)
     assert len(done) == 6
 
@@ -173,7 +174,7 @@ def test_a_rollout_that_crashes_costs_itself_alone(
     underway.sweep()
     (tmp_path / "crash-2").write_text("99")
     wide = missing_jobs("random-v0", 8, [], 4)
-    done: list[FakeReceipt] = []
+    done: list[Receipt] = []
     ray_fleet.run(Listed(plan(), wide), done.append)
     assert sorted(receipt.shard_id for receipt in done) == [job.shard_id for job in wide]
     assert sum(receipt.quarantined for receipt in done) == 1
@@ -246,7 +247,7 @@ def warnings_of(name: str) -> Iterator[list[str]]:
 def test_an_actor_holds_at_most_two_jobs(ray_fleet: Fleet, tmp_path: Path) -> None:
     most = 0
 
-    def watch(receipt: FakeReceipt) -> None:
+    def watch(receipt: Receipt) -> None:
         nonlocal most
         seats = ray_fleet._seats  # type: ignore[attr-defined]
         most = max(most, *(len(seat.orders) for seat in seats))
@@ -272,7 +273,7 @@ class InstantActor:
 
     def __init__(self, number: int, comes: bool = True, backwards: bool = False) -> None:
         self._name, self._comes, self._backwards = f"host-1~{number}~1", comes, backwards
-        self._held: list[tuple[Future[FakeReceipt], FakeReceipt]] = []
+        self._held: list[tuple[Future[Receipt], Receipt]] = []
 
     def arrive(self) -> "Future[str]":
         answer: Future[str] = Future()
@@ -280,11 +281,9 @@ class InstantActor:
             answer.set_result(self._name)
         return answer
 
-    def run(
-        self, plan: object, job: Job, policy: list[object], quarantined: Mapping[int, str]
-    ) -> "Future[FakeReceipt]":
-        answer: Future[FakeReceipt] = Future()
-        self._held.append((answer, FakeReceipt(job.shard_id, 1, 4, 1, {"ok": 4}, {"total": 0.01})))
+    def run(self, plan: object, job: Job, policy: list[object], quarantined: Mapping[int, str]) -> "Future[Receipt]":
+        answer: Future[Receipt] = Future()
+        self._held.append((answer, Receipt(job.shard_id, 1, 4, 1, {"ok": 4}, {"total": 0.01})))
         if len(self._held) == (IN_FLIGHT if self._backwards else 1):
             for future, receipt in reversed(self._held):
                 future.set_result(receipt)
@@ -311,7 +310,7 @@ def test_no_job_waits_for_an_actor_that_never_comes(ray_fleet: Fleet, tmp_path: 
 
 def test_answers_are_taken_in_the_order_of_what_was_asked(ray_fleet: Fleet, tmp_path: Path) -> None:
     fleet = instant_fleet(tmp_path, [InstantActor(0, backwards=True)], 1)
-    receipts: list[FakeReceipt] = []
+    receipts: list[Receipt] = []
     fleet.run(Listed(plan(), jobs(8)), receipts.append)
     assert [receipt.shard_id for receipt in receipts] == [job.shard_id for job in jobs(8)]
 

@@ -30,13 +30,16 @@ def commit(where: str, job: Job) -> None:
     Store.open(where).commit(PLAN, job, ROLLOUTS[job], {})
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The digest without any fault."""
-    store = Store.create(tmp_path_factory.mktemp("undisturbed") / "store", SETTING)
+def digest_without_faults(folder: Path) -> str:
+    store = Store.create(folder / "store", SETTING)
     for job in JOBS:
         commit(store.where, job)
     return store.digest()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return digest_without_faults(tmp_path_factory.mktemp("undisturbed"))
 
 
 def disturb(where: str, faults: Faults, fault: Fault, undisturbed: str) -> int:

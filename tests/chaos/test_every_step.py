@@ -4,22 +4,17 @@ from pathlib import Path
 
 import pytest
 
-from shared.store import Store
 from tests.chaos.counts import Counts
 from tests.faults import BUCKET_FAULTS, DISK_FAULTS, KILLS, bucket_faults, disk_faults
 from tests.test_store_crashes import run
-from tests.test_store_faults import JOBS, SETTING, commit, disturb_all, kill_at_all
+from tests.test_store_faults import digest_without_faults, disturb_all, kill_at_all
 
 pytestmark = pytest.mark.chaos
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The digest without any fault."""
-    store = Store.create(tmp_path_factory.mktemp("undisturbed") / "store", SETTING)
-    for job in JOBS:
-        commit(store.where, job)
-    return store.digest()
+    return digest_without_faults(tmp_path_factory.mktemp("undisturbed"))
 
 
 @pytest.mark.parametrize("kind", DISK_FAULTS)
