@@ -238,7 +238,8 @@ class _Costs:
         return self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance)
 
     def _affordance_s(self, told: AffordanceConfig) -> float:
-        return told.steps * told.points * told.proposals * self.rates.scored_row_s
+        answered = told.questions * told.proposals * self.rates.scored_row_s
+        return answered + self._steps_s(told.steps, 0, told.points)
 
     def _steps_s(self, steps: int, clouds: int, rows: int) -> float:
         return steps * (clouds * self.encode_s + rows * self.rates.trained_row_s)

@@ -14,10 +14,11 @@ from torch import Tensor, nn
 from learner.augmentation import draw_turns
 from learner.configuration import AapConfig
 from learner.data import Dataset, Split
+from learner.features import FrozenFeatures
 from learner.losses import action_scoring_loss, distillation_loss
 from learner.metrics import discrimination, discrimination_in_chunks
 from learner.oracle import OracleCritic, Teacher
-from learner.sampling import Batch, OrderedRows, draw_numbers, frozen_features, order_rows, spread
+from learner.sampling import Batch, OrderedRows, draw_numbers, order_rows, spread
 from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aap import Aap
@@ -88,7 +89,7 @@ class AapStage:
     def __init__(
         self,
         aap: Aap,
-        dataset: Dataset,
+        known: FrozenFeatures,
         parts: Split,
         config: AapConfig,
         teacher: Teacher | None = None,
@@ -99,7 +100,7 @@ class AapStage:
 
         Args:
             aap: what is trained.
-            dataset: the interactions.
+            known: the interactions, and features of them for privileged training, which leaves the encoder as it is.
             parts: which to learn from, and which to judge by.
             config: how.
             teacher: what an oracle says of the rows; privileged training only.
@@ -107,14 +108,13 @@ class AapStage:
         """
         self.module: nn.Module = aap
         self.aap = aap
-        self.dataset = dataset
+        self.dataset = known.dataset
         self.parts = parts
         self.config = config
-        rows = dataset.rows
         self._features = self._teacher = None
         self._trained = trained
         if config.training == "privileged":
-            self._features = frozen_features(aap.encoder, dataset.clouds, rows.cloud, rows.point)
+            self._features = known.rows(aap.encoder)
             self._teacher = teacher
 
     def parameter_groups(self) -> list[ParameterGroup]:

@@ -1,7 +1,8 @@
 """The affordance networks D: each learns what its frozen critic makes of the prior's proposals at a point.
 
 They are trained when their critic is done. Beside it, they would chase a critic that moves, and their loss would have a
-say in which critic is kept. A step needs no point encoder, since features under frozen weights are computed once.
+say in which critic is kept. The critic answers all questions before the first step: a hundred scores a question cost
+far more than a step of D, which may then meet a question several times.
 
 Shapes: B rollouts, K the longest context, Q questions (a point and a z), S proposals.
 """
@@ -13,15 +14,15 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from learner.configuration import AffordanceConfig
 from learner.data import Dataset, Split
+from learner.features import ProposalPool
 from learner.frozen import FrozenAap
-from learner.losses import actionability_loss, mean_score, top_score
+from learner.losses import actionability_loss, mean_actionability_loss, mean_information_loss, mean_score, top_score
 from learner.metrics import rank_correlation
-from learner.sampling import OrderedRows, ProposalPool, draw_numbers, order_rows, spread
+from learner.sampling import OrderedRows, draw_numbers, order_rows
 from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
 from shared.networks.aip import Aip
@@ -29,9 +30,10 @@ from shared.networks.prior import Prior
 
 RowOrder = Callable[[Sequence[int], int, np.random.Generator], OrderedRows]
 """Orders rows of rollouts, at most so many of each."""
-VALIDATION_ROLLOUTS = 32
+VALIDATION_QUESTIONS = 1_024
 _VALIDATION_SEED = 22
-_VALIDATION_BATCHES = 8
+_CHUNK = 64
+"""Questions whose proposals are scored at once; bounds memory, and what is scored stays in the processor's cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,125 +54,161 @@ class Questions:
     frames: Tensor
     latents: Tensor
 
-    def select(self, places: slice) -> "Questions":
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """What a critic made of questions, and what D is told of them.
+
+    Attributes:
+        told: D's inputs, [Q, ...] each.
+        target: what D is to say, [Q].
+    """
+
+    told: tuple[Tensor, ...]
+    target: Tensor
+
+    def select(self, numbers: Tensor) -> "Answered":
         """Some of them."""
-        return Questions(
-            self.cloud[places], self.slot[places], self.point[places], self.frames[places], self.latents[places]
-        )
+        return Answered(tuple(each[numbers] for each in self.told), self.target[numbers])
 
 
-class Answer(Protocol):
+class Critic(Protocol):
     """A D network and the critic that supervises it."""
 
     module: nn.Module
     """All that is trained, and nothing else."""
 
-    def __call__(self, questions: Questions) -> tuple[Tensor, Tensor]:
-        """Actionability as D predicts it, and what the critic makes of it, [Q] each."""
+    def answer(self, questions: Questions) -> tuple[tuple[Tensor, ...], Tensor]:
+        """What D is told of the questions, [Q, ...] each, and what the critic makes of them, [Q]."""
+        ...
+
+    def predict(self, *told: Tensor) -> Tensor:
+        """Actionability as D predicts it, [Q]."""
+        ...
+
+    def mean_loss(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """A loss that is least at the mean."""
         ...
 
 
 class AffordanceStage:
-    """Trains one D network: L1 to its critic (Where2Act; AdaAfford, AAP and AIP Actionability Scoring Loss)."""
+    """Trains one D network on its critic's answers (Where2Act; AdaAfford, AAP and AIP Actionability Scoring Loss)."""
 
     def __init__(
         self,
         name: str,
-        answer: Answer,
+        critic: Critic,
         dataset: Dataset,
         parts: Split,
         config: AffordanceConfig,
         pool: ProposalPool,
+        rng: np.random.Generator,
         frozen: FrozenAap | None = None,
         order: RowOrder | None = None,
         shortest: int = 0,
     ) -> None:
-        """Collect what a stage needs.
+        """Have the critic answer all questions.
 
         Args:
             name: of the stage.
-            answer: D, and its critic.
+            critic: D, and its critic.
             dataset: the interactions.
             parts: which of them to learn from.
             config: how.
             pool: points and proposals.
+            rng: draws the questions to learn from.
             frozen: whose z is asked about; None for Where2Act, which has none.
             order: draws the tries; at random where it is not given.
             shortest: the fewest tries whose z is asked about, where a rollout has as many.
         """
         self.name = name
-        self.module = answer.module.requires_grad_(True)
-        self.answer = answer
+        self.module = critic.module.requires_grad_(True)
+        self.critic = critic
         self.dataset = dataset
-        self.parts = parts
         self.config = config
         self.pool = pool
         self.frozen = frozen
         self.order = order or partial(order_rows, dataset)
         self.shortest = shortest
+        self._loss = actionability_loss if config.loss == "published" else critic.mean_loss
+        self._train = self._ask(parts.train, config.questions, rng)
+        self._validation = self._ask(parts.validation, VALIDATION_QUESTIONS, np.random.default_rng(_VALIDATION_SEED))
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """D alone."""
         return [ParameterGroup(tuple(self.module.parameters()))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
-        """The loss at some points of a few rollouts' clouds."""
-        train = self.parts.train
-        chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
-        questions = self._questions([train[number] for number in chosen], rng)
-        predicted, target = self.answer(questions.select(share(len(questions.cloud))))
-        return StepResult({"affordance": actionability_loss(predicted, target)}, len(questions.cloud))
+        """The loss on some of the questions."""
+        drawn = draw_numbers(self.config.questions, min(self.config.points, self.config.questions), rng)
+        asked = self._train.select(torch.as_tensor(drawn[share(len(drawn))]))
+        return StepResult({"affordance": self._loss(self.critic.predict(*asked.told), asked.target)}, len(drawn))
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """L1 and rank correlation with the critic on objects not trained on; "of_median" is a constant's L1."""
-        rng = np.random.default_rng(_VALIDATION_SEED)
-        rollouts = spread(self.parts.validation, VALIDATION_ROLLOUTS)
-        pairs = [self.answer(self._questions(rollouts, rng)) for _ in range(_VALIDATION_BATCHES)]
-        predicted, target = (torch.cat(column) for column in zip(*pairs, strict=True))
-        score = float(actionability_loss(predicted, target))
+        """Loss and rank correlation with the critic on objects not trained on, and the loss of the best constant."""
+        target = self._validation.target
+        predicted = self.critic.predict(*self._validation.told)
+        constant = target.median() if self.config.loss == "published" else target.mean()
+        score = float(self._loss(predicted, target))
         return {
             "score": score,
             "affordance": score,
-            "affordance_of_median": float((target - target.median()).abs().mean()),
+            "affordance_of_constant": float(self._loss(constant.expand_as(target), target)),
             "affordance_rank_correlation": rank_correlation(predicted.numpy(force=True), target.numpy(force=True)),
         }
 
-    def _questions(self, rollouts: Sequence[int], rng: np.random.Generator) -> Questions:
-        config, count = self.config, self.config.points
-        ordered = self.order(rollouts, config.context + 1, rng)
+    @torch.no_grad()
+    def _ask(self, rollouts: Sequence[int], count: int, rng: np.random.Generator) -> Answered:
+        """Draw questions about rollouts, each with a z of some of its tries, and have them answered."""
+        ordered = self.order(rollouts, self.config.context + 1, rng)
         drawn = rng.integers(0, len(rollouts), count)
         which = torch.as_tensor(drawn)
-        row = torch.as_tensor(_below(ordered.valid.sum(dim=1).numpy(force=True)[drawn], rng))
+        row = torch.as_tensor(rng.integers(0, ordered.valid.sum(dim=1).numpy(force=True)[drawn]))
         cloud = ordered.clouds[ordered.cloud[which, row]]
         slot = torch.as_tensor(rng.integers(0, self.pool.point.shape[1], count))
-        latents = torch.zeros(count, 0)
-        if self.frozen is not None:
-            context = ordered.longest_context(config.context)
-            prefixes = self.frozen.latents(ordered.rows[:, :context])
-            latents = prefixes[which, torch.as_tensor(rng.integers(min(self.shortest, context), context + 1, count))]
-        frames = self.pool.draw(cloud, slot, config.proposals, rng)
         place = self.dataset.clouds.points[cloud, self.pool.point[cloud, slot]] - self.dataset.middles[cloud]
-        return Questions(cloud, slot, place, frames, latents)
+        latents = self._latents(ordered, which, rng)
+        chunks = []
+        for start in range(0, count, _CHUNK):
+            here = slice(start, start + _CHUNK)
+            frames = self.pool.draw(cloud[here], slot[here], self.config.proposals, rng)
+            chunks.append(self.critic.answer(Questions(cloud[here], slot[here], place[here], frames, latents[here])))
+        told = zip(*(told for told, _ in chunks), strict=True)
+        return Answered(tuple(torch.cat(each) for each in told), torch.cat([target for _, target in chunks]))
+
+    def _latents(self, ordered: OrderedRows, which: Tensor, rng: np.random.Generator) -> Tensor:
+        """The z of the first tries of some of the rollouts, of which there may be none, [Q, latent_width]."""
+        if self.frozen is None:
+            return torch.zeros(len(which), 0)
+        context = ordered.longest_context(self.config.context)
+        prefixes = self.frozen.latents(ordered.rows[:, :context])
+        lengths = rng.integers(min(self.shortest, context), context + 1, len(which))
+        return prefixes[which, torch.as_tensor(lengths)]
 
 
-class PriorAnswer:
+class PriorCritic:
     """Where2Act: the mean score of all proposals."""
 
     def __init__(self, prior: Prior, pool: ProposalPool) -> None:
-        self.module: nn.Module = prior.affordance_head
+        self.module: nn.Module = prior.affordance_network()
         self.prior = prior
         self.pool = pool
 
-    def __call__(self, questions: Questions) -> tuple[Tensor, Tensor]:
-        """Predicted and target, [Q] each."""
+    def answer(self, questions: Questions) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Features and places, and the mean of the scores."""
         features = self.pool.features[questions.cloud, questions.slot]
-        with torch.no_grad():
-            logits = self.prior.action_logits(features[:, None], questions.point[:, None], questions.frames)
-        return self.prior.actionability(features), mean_score(torch.sigmoid(logits))
+        logits = self.prior.action_logits(features[:, None], questions.point[:, None], questions.frames)
+        return (features, questions.point), mean_score(torch.sigmoid(logits))
+
+    def predict(self, *told: Tensor) -> Tensor:
+        """a_p."""
+        return self.prior.actionability(*told)
+
+    mean_loss = staticmethod(mean_actionability_loss)
 
 
-class AapAnswer:
+class AapCritic:
     """AAP: the mean of the best scores that the critic gives under z."""
 
     def __init__(self, frozen: FrozenAap, top: int) -> None:
@@ -178,44 +216,49 @@ class AapAnswer:
         self.frozen = frozen
         self.top = top
 
-    def __call__(self, questions: Questions) -> tuple[Tensor, Tensor]:
-        """Predicted and target, [Q] each."""
+    def answer(self, questions: Questions) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Features, places and z, and the mean of the best scores."""
         features, scores = aap_scores(self.frozen, questions)
-        return self.frozen.aap.actionability(features, questions.point, questions.latents), top_score(scores, self.top)
+        return (features, questions.point, questions.latents), top_score(scores, self.top)
+
+    def predict(self, *told: Tensor) -> Tensor:
+        """a_p|z."""
+        return self.frozen.aap.actionability(*told)
+
+    mean_loss = staticmethod(mean_actionability_loss)
 
 
-class AipAnswer:
+class AipCritic:
     """AIP: the mean of the best AIP scores under z."""
 
     def __init__(self, aip: Aip, features: Tensor, frozen: FrozenAap, top: int) -> None:
-        self.module: nn.Module = nn.ModuleDict({"encoder": aip.actionability_encoder, "head": aip.affordance_head})
+        self.module: nn.Module = aip.affordance_network()
         self.aip = aip
         self.features = features
         self.frozen = frozen
         self.top = top
 
-    def __call__(self, questions: Questions) -> tuple[Tensor, Tensor]:
-        """Predicted and target, [Q] each."""
+    def answer(self, questions: Questions) -> tuple[tuple[Tensor, ...], Tensor]:
+        """Features, places, z and what AAP makes of the points, and the mean of the best scores."""
         aap_features, scores = aap_scores(self.frozen, questions)
         features, latents = self.features[questions.cloud, questions.slot], questions.latents
-        with torch.no_grad():
-            believed = self.frozen.aap.actionability(aap_features, questions.point, latents)
-            gains = self.aip.action_scores(
-                features[:, None], questions.point[:, None], questions.frames, latents[:, None], scores
-            )
-        return self.aip.actionability(features, latents, believed), top_score(gains, self.top)
+        believed = self.frozen.aap.actionability(aap_features, questions.point, latents)
+        gains = self.aip.action_scores(
+            features[:, None], questions.point[:, None], questions.frames, latents[:, None], scores
+        )
+        return (features, questions.point, latents, believed), top_score(gains, self.top)
+
+    def predict(self, *told: Tensor) -> Tensor:
+        """a^AIP_p|z."""
+        return self.aip.actionability(*told)
+
+    mean_loss = staticmethod(mean_information_loss)
 
 
-@torch.no_grad()
 def aap_scores(frozen: FrozenAap, questions: Questions) -> tuple[Tensor, Tensor]:
-    """AAP's features of the points, [Q, feature_width], and its scores of the proposals there, [Q, S]."""
-    assert frozen.pool_features is not None, "the points asked about are those of a pool"
+    """AAP's features of the points, [Q, point_width], and its scores of the proposals there, [Q, S]."""
     features = frozen.pool_features[questions.cloud, questions.slot]
     logits = frozen.aap.action_logits(
         features[:, None], questions.point[:, None], questions.frames, questions.latents[:, None]
     )
     return features, torch.sigmoid(logits)
-
-
-def _below(limits: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-    return rng.integers(0, limits)

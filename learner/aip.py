@@ -75,8 +75,9 @@ class AipStage:
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """All of AIP but D and what is inherited, at one rate; nothing of AAP."""
-        own = ("actionability_encoder.", "affordance_head.", *(("encoder.",) if self._inherits else ()))
-        return [ParameterGroup(tuple(p for name, p in self.aip.named_parameters() if not name.startswith(own)))]
+        others = [self.aip.affordance_network(), *([self.aip.encoder] if self._inherits else [])]
+        left = {id(p) for module in others for p in module.parameters()}
+        return [ParameterGroup(tuple(p for p in self.aip.parameters() if id(p) not in left))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The critic's loss on a few rollouts, several ordered subsets of each."""

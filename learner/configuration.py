@@ -41,11 +41,16 @@ class AugmentationConfig(StrictModel):
 class AffordanceConfig(TrainingConfig):
     """An affordance network D, trained when its critic is done."""
 
+    loss: Literal["mean", "published"] = "mean"
+    """"published": L1, which finds the median of what a critic makes of a point, and that is next to nothing where
+    successes are rare. "mean": cross entropy, and squares for AIP, which find the mean."""
     steps: int = Field(300, ge=1)
     learning_rate: float = Field(3e-3, gt=0)
-    batch_rollouts: int = Field(16, ge=1)
-    points: int = Field(64, ge=1)
-    """Points a step."""
+    questions: int = Field(6_400, ge=1, le=10_000_000)
+    """Points, each with a z, that the critic answers for D to learn from; where it answers as many as `steps` times
+    `points`, each is met once, as published."""
+    points: int = Field(256, ge=1)
+    """Of the questions, a step."""
     context: int = Field(8, ge=0)
     """The longest context whose z is asked about; AAP and AIP only."""
     proposals: int = Field(100, ge=1)

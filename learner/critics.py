@@ -9,12 +9,11 @@ import torch
 from torch import Tensor
 
 from learner.data import Dataset
-from learner.frozen import FrozenPrior
+from learner.features import FrozenFeatures
+from learner.frozen import FrozenAap, FrozenPrior
 from learner.oracle import OracleCritic, Teacher
-from learner.sampling import frozen_features
 from learner.where2act_adaptation import corrected_scores
 from shared.methods import CriticName
-from shared.networks.aap import Aap
 from shared.networks.where2act_adaptation import Where2ActAdaptation
 from shared.policy import Policy
 
@@ -27,7 +26,7 @@ class RowCritic(Protocol):
         ...
 
 
-def row_critic(name: CriticName, policy: Policy, dataset: Dataset) -> RowCritic:
+def row_critic(name: CriticName, policy: Policy, known: FrozenFeatures) -> RowCritic:
     """The critic of a policy that is called `name`.
 
     Raises:
@@ -35,17 +34,17 @@ def row_critic(name: CriticName, policy: Policy, dataset: Dataset) -> RowCritic:
     """
     match name:
         case "where2act":
-            return PriorScores(FrozenPrior.of(policy.prior, dataset))
+            return PriorScores(FrozenPrior.of(policy.prior, known))
         case "aap":
-            return AdaptiveScores(policy.aap, dataset)
+            return AdaptiveScores(FrozenAap.of(policy.aap, known), known.dataset)
         case "where2act-interaction":
             policy.require(name)
             assert policy.where2act_interaction is not None, "a trained module is there"
-            return AdaptiveScores(policy.where2act_interaction, dataset)
+            return AdaptiveScores(FrozenAap.of(policy.where2act_interaction, known), known.dataset)
         case "where2act-adaptation":
             policy.require(name)
             assert policy.where2act_adaptation is not None, "a trained module is there"
-            return CorrectedScores(policy.where2act_adaptation, FrozenPrior.of(policy.prior, dataset), dataset)
+            return CorrectedScores(policy.where2act_adaptation, FrozenPrior.of(policy.prior, known), known.dataset)
 
 
 class PriorScores:
@@ -63,20 +62,16 @@ class AdaptiveScores:
     """AAP, or Where2Act-interaction, which shares its form."""
 
     @torch.no_grad()
-    def __init__(self, aap: Aap, dataset: Dataset) -> None:
-        self._aap, self._rows = aap, dataset.rows
-        rows = dataset.rows
-        self._features = frozen_features(aap.encoder, dataset.clouds, rows.cloud, rows.point)
-        self._codes, self._weights = aap.interaction_codes(
-            self._features, rows.xyz, rows.frame, rows.motion, rows.success
-        )
+    def __init__(self, frozen: FrozenAap, dataset: Dataset) -> None:
+        self._frozen, self._rows = frozen, dataset.rows
 
     @torch.no_grad()
     def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
         """s_u|z."""
-        latent = self._aap.latent(self._codes[tries], self._weights[tries])
+        frozen, rows = self._frozen, self._rows
+        latent = frozen.latents(tries)[-1]
         return torch.sigmoid(
-            self._aap.action_logits(self._features[asked], self._rows.xyz[asked], self._rows.frame[asked], latent)
+            frozen.aap.action_logits(frozen.features[asked], rows.xyz[asked], rows.frame[asked], latent)
         )
 
 
@@ -98,8 +93,8 @@ class CorrectedScores:
 class OracleScores:
     """The oracle critic, which is told the hidden facts and needs no tries."""
 
-    def __init__(self, oracle: OracleCritic, dataset: Dataset) -> None:
-        self._teacher = Teacher.of(oracle, dataset)
+    def __init__(self, oracle: OracleCritic, known: FrozenFeatures) -> None:
+        self._teacher = Teacher.of(oracle, known)
 
     def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
         """s_u with z = h(hidden facts)."""

@@ -17,11 +17,12 @@ from torch import Tensor
 
 from learner.critics import OracleScores
 from learner.data import Dataset
+from learner.features import FrozenFeatures
 from learner.frozen import FrozenAap, FrozenPrior
 from learner.losses import action_scoring_losses
 from learner.metrics import correlation
 from learner.oracle import OracleCritic
-from learner.sampling import OrderedRows, frozen_features, order_rows
+from learner.sampling import OrderedRows, order_rows
 from shared.networks.aip import Aip
 from shared.networks.prior import Prior
 
@@ -92,7 +93,7 @@ class Candidates:
 
 
 def answer(
-    dataset: Dataset,
+    known: FrozenFeatures,
     candidates: Candidates,
     frozen: FrozenAap,
     prior: Prior,
@@ -103,7 +104,7 @@ def answer(
     """Ask critics about the questions.
 
     Args:
-        dataset: the interactions.
+        known: of the interactions.
         candidates: of rollouts whose objects nothing was trained on.
         frozen: the AAP.
         prior: Where2Act.
@@ -111,20 +112,20 @@ def answer(
         oracle: a critic that is told the hidden facts.
         tries: numbers of tries.
     """
-    ordered, asked = candidates.ordered, candidates.questions
+    dataset, ordered, asked = known.dataset, candidates.ordered, candidates.questions
     index = ordered.rows[asked]
     owner = np.array([dataset.objects[number] for number in candidates.rollouts])
-    scores = {Asked("where2act", 0): FrozenPrior.of(prior, dataset).scores[index]}
+    scores = {Asked("where2act", 0): FrozenPrior.of(prior, known).scores[index]}
     most = max(tries)
     chosen: dict[CriticKind, Tensor] = {"random": candidates.rows[:, :most]}
     if aip is not None:
-        chosen["aip"] = tries_by_aip(dataset, candidates.rows, frozen, aip, most)
+        chosen["aip"] = tries_by_aip(known, candidates.rows, frozen, aip, most)
     for critic, made in chosen.items():
         latents = frozen.latents(made)
         for number in tries:
             scores[Asked(critic, number)] = _scores(dataset, ordered.rows, frozen, latents[:, number])[asked]
     if oracle is not None:
-        scores[Asked("oracle", 0)] = OracleScores(oracle, dataset)(index, torch.zeros(0, dtype=torch.long))
+        scores[Asked("oracle", 0)] = OracleScores(oracle, known)(index, torch.zeros(0, dtype=torch.long))
     return Answers(
         labels=dataset.rows.success[index].numpy(force=True) > 0.5,
         objects=owner.repeat(asked.sum(dim=1).numpy()),
@@ -133,20 +134,17 @@ def answer(
 
 
 @torch.no_grad()
-def tries_by_aip(dataset: Dataset, candidates: Tensor, frozen: FrozenAap, aip: Aip, most: int) -> Tensor:
+def tries_by_aip(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, aip: Aip, most: int) -> Tensor:
     """The rows that AIP would try one after the other, each the best by its critic after those before, [R, most].
 
     Args:
-        dataset: the interactions.
+        known: of the interactions.
         candidates: rows to choose from, [R, c].
         frozen: the AAP, whose z the choice depends on.
         aip: the chooser.
         most: how many tries.
     """
-    rows = dataset.rows
-    features = frozen_features(
-        aip.encoder, dataset.clouds, rows.cloud[candidates].flatten(), rows.point[candidates].flatten()
-    ).reshape(*candidates.shape, -1)
+    rows, features = known.dataset.rows, known.rows(aip.encoder)[candidates]
     xyz, frames = rows.xyz[candidates], rows.frame[candidates]
     made = candidates[:, :0]
     free = torch.ones(candidates.shape, dtype=torch.bool)
@@ -195,11 +193,10 @@ class ProposalGain:
 
 @torch.no_grad()
 def proposal_gains(
-    dataset: Dataset, candidates: Candidates, frozen: FrozenAap, aip: Aip, before: Sequence[int] = (0, 1, 2)
+    known: FrozenFeatures, candidates: Candidates, frozen: FrozenAap, aip: Aip, before: Sequence[int] = (0, 1, 2)
 ) -> list[ProposalGain]:
     """Whether the AIP critic picks better tries than chance among the candidates that a rollout happens to have."""
-    rows = dataset.rows
-    features = frozen_features(aip.encoder, dataset.clouds, rows.cloud, rows.point)
+    dataset, features = known.dataset, known.rows(aip.encoder)
     ordered, found = candidates.ordered, []
     for number in before:
         parts = [

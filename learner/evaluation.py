@@ -15,6 +15,7 @@ from torch import Tensor
 from learner.bootstrap import f_score_interval, ratio_interval
 from learner.critics import OracleScores, RowCritic, row_critic
 from learner.data import Dataset, load_dataset
+from learner.features import FrozenFeatures
 from learner.metrics import THRESHOLD, discrimination
 from learner.oracle import OracleCritic
 from shared.errors import StoreError
@@ -126,7 +127,7 @@ def evaluate(
         judge.row(NO_TRIES_METHOD, 0, judge.critic("aap", version)),
     ]
     if oracle is not None:
-        rows.append(judge.row(ORACLE_METHOD, 0, OracleScores(oracle.eval(), dataset)))
+        rows.append(judge.row(ORACLE_METHOD, 0, OracleScores(oracle.eval(), judge.known)))
     for name in _methods(dataset):
         method = method_named(name)
         critic = judge.critic(method.critic, method.policy_version(version))
@@ -153,6 +154,7 @@ class _Judge:
     def __init__(self, dataset: Dataset, policies: Mapping[int, Policy]) -> None:
         rows = dataset.rows
         self.dataset, self.policies = dataset, policies
+        self.known = FrozenFeatures(dataset)
         self.queries = [index[rows.role[index.numpy()] == Role.QUERY.value] for index in dataset.rollouts]
         if not sum(map(len, self.queries)):
             raise StoreError("the store holds no query to judge by; evaluate on a store made by an evaluation plan")
@@ -165,7 +167,7 @@ class _Judge:
     def critic(self, name: CriticName, version: int) -> RowCritic:
         """A critic of a policy, made once for all methods that share it."""
         if (name, version) not in self._critics:
-            self._critics[name, version] = row_critic(name, self.policies[version], self.dataset)
+            self._critics[name, version] = row_critic(name, self.policies[version], self.known)
         return self._critics[name, version]
 
     def row(self, method: str, budget: int, critic: RowCritic) -> EvaluationRow:

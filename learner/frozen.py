@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from learner.data import Dataset
-from learner.sampling import ProposalPool, frozen_features
+from learner.features import FrozenFeatures
 from shared.networks.aap import Aap
 from shared.networks.prior import Prior
 
@@ -27,12 +26,11 @@ class FrozenPrior:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, prior: Prior, dataset: Dataset) -> "FrozenPrior":
-        """Encode everything."""
-        rows = dataset.rows
-        features = frozen_features(prior.encoder, dataset.clouds, rows.cloud, rows.point)
+    def of(cls, prior: Prior, known: FrozenFeatures) -> "FrozenPrior":
+        """Ask it about everything."""
+        rows, features = known.dataset.rows, known.rows(prior.encoder)
         scores = torch.sigmoid(prior.action_logits(features, rows.xyz, rows.frame))
-        return cls(features, scores, prior.actionability(features))
+        return cls(features, scores, prior.actionability(features, rows.xyz))
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,27 +40,25 @@ class FrozenAap:
     Attributes:
         aap: frozen.
         features: of the rows' points, [I, point_width].
-        pool_features: of the pool's points, [O, P, point_width]; None where no pool was given.
+        pool_features: of the pool's points, [O, P, point_width].
         codes: z_I of the rows, [I, latent_width].
         weights: w_I of the rows, [I].
     """
 
     aap: Aap
     features: Tensor
-    pool_features: Tensor | None
+    pool_features: Tensor
     codes: Tensor
     weights: Tensor
 
     @classmethod
     @torch.no_grad()
-    def of(cls, aap: Aap, dataset: Dataset, pool: ProposalPool | None = None) -> "FrozenAap":
-        """Encode everything."""
+    def of(cls, aap: Aap, known: FrozenFeatures) -> "FrozenAap":
+        """Ask it about everything."""
         aap.eval().requires_grad_(False)
-        rows = dataset.rows
-        features = frozen_features(aap.encoder, dataset.clouds, rows.cloud, rows.point)
-        pool_features = None if pool is None else pool.features_under(aap.encoder, dataset.clouds)
+        rows, features = known.dataset.rows, known.rows(aap.encoder)
         codes, weights = aap.interaction_codes(features, rows.xyz, rows.frame, rows.motion, rows.success)
-        return cls(aap, features, pool_features, codes, weights)
+        return cls(aap, features, known.pool(aap.encoder), codes, weights)
 
     def latents(self, tries: Tensor) -> Tensor:
         """The z of every prefix of ordered rows `tries`, [..., K]; [..., K + 1, latent_width]."""

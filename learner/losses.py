@@ -8,6 +8,9 @@ from learner.sharing import averaged, shared_mean
 from shared.networks.actions import geodesic_distance
 from shared.networks.aip import SCORE_SCALE
 
+_SURE = 1e-6
+"""Keeps the logarithm of a probability that was rounded to 0 or 1 finite."""
+
 
 def action_scoring_loss(logits: Tensor, successes: Tensor, mask: Tensor | None = None) -> Tensor:
     """Binary cross entropy of action scores, nats (Where2Act; AdaAfford, AAP Action Scoring Loss).
@@ -43,6 +46,16 @@ def proposal_loss(proposals: Tensor, frames: Tensor) -> Tensor:
 def actionability_loss(predicted: Tensor, target: Tensor) -> Tensor:
     """L1 between actionability and what a critic made of it; no gradient reaches the critic (all D networks)."""
     return (predicted - target.detach()).abs().mean()
+
+
+def mean_actionability_loss(predicted: Tensor, target: Tensor) -> Tensor:
+    """Cross entropy, nats, between actionability and what a critic made of it, both in [0, 1]; not in the paper.
+
+    L1 is least at the median, and where successes are rare most points are worth next to nothing: D then says so of
+    all of them. What is expected of a point is a mean, where the cross entropy is least.
+    """
+    predicted, target = predicted.float().clamp(_SURE, 1.0 - _SURE), target.detach().float()
+    return -(target * predicted.log() + (1.0 - target) * (1.0 - predicted).log()).mean()
 
 
 def mean_score(scores: Tensor) -> Tensor:
@@ -83,13 +96,14 @@ def information_loss(predicted: Tensor, gains: Tensor, mask: Tensor) -> Tensor:
     return masked_mean((predicted - gains.detach()).abs(), mask)
 
 
-def mean_information_loss(predicted: Tensor, gains: Tensor, mask: Tensor) -> Tensor:
+def mean_information_loss(predicted: Tensor, gains: Tensor, mask: Tensor | None = None) -> Tensor:
     """Squared error between AIP action scores and their targets, in units of `SCORE_SCALE`; not in the paper.
 
     L1 is least at the median, and where successes are rare most tries tell nothing: the median gain of any try is
     then about zero. What a proposal is worth is its mean gain, where squares are least.
     """
-    return masked_mean(((predicted - gains.detach()) / SCORE_SCALE).square(), mask)
+    losses = ((predicted - gains.detach()) / SCORE_SCALE).square()
+    return masked_mean(losses, torch.ones_like(losses, dtype=torch.bool) if mask is None else mask)
 
 
 def distillation_loss(latents: Tensor, target: Tensor, mask: Tensor) -> Tensor:

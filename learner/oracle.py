@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from learner.data import Dataset
 from learner.facts import FACTS_WIDTH
-from learner.sampling import Batch, frozen_features
+from learner.features import FrozenFeatures
+from learner.sampling import Batch
 from shared.files import read_bounded
 from shared.networks.aap import Aap, OracleEncoder
 from shared.networks.configuration import NetworkConfig
@@ -54,11 +54,10 @@ class Teacher:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, oracle: OracleCritic, dataset: Dataset) -> "Teacher":
+    def of(cls, oracle: OracleCritic, known: FrozenFeatures) -> "Teacher":
         """Ask the oracle about everything."""
         oracle.eval().requires_grad_(False)
-        rows = dataset.rows
-        features = frozen_features(oracle.aap.encoder, dataset.clouds, rows.cloud, rows.point)
+        rows, features = known.dataset.rows, known.rows(oracle.aap.encoder)
         latents = oracle.oracle(rows.facts)
         scores = torch.sigmoid(oracle.aap.action_logits(features, rows.xyz, rows.frame, latents))
         return cls(latents, scores)

@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from learner.augmentation import draw_turns, turn_vectors
 from learner.configuration import PriorConfig
 from learner.data import Dataset, Split
+from learner.features import frozen_features
 from learner.losses import action_scoring_loss, proposal_loss
 from learner.metrics import discrimination
-from learner.sampling import draw_numbers, frozen_features, spread
+from learner.sampling import draw_numbers, spread
 from learner.sharing import share
 from learner.training import ParameterGroup, StepResult
 from shared.networks.prior import Prior
@@ -42,8 +43,8 @@ class PriorStage:
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """All of the prior but D, at one rate."""
-        trained = (p for name, p in self.prior.named_parameters() if not name.startswith("affordance_head."))
-        return [ParameterGroup(tuple(trained))]
+        left = {id(p) for p in self.prior.affordance_network().parameters()}
+        return [ParameterGroup(tuple(p for p in self.prior.parameters() if id(p) not in left))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """Both losses on the rows of a few clouds."""

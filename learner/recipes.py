@@ -9,15 +9,15 @@ from safetensors.torch import save
 
 from learner import sharing
 from learner.aap import AapStage, OracleStage
-from learner.affordance import AapAnswer, AffordanceStage, AipAnswer, PriorAnswer
+from learner.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic, RowOrder
 from learner.aip import AipStage
 from learner.configuration import AffordanceConfig, LearnerConfig, TrainingConfig
 from learner.data import Dataset, Split
+from learner.features import FrozenFeatures, ProposalPool
 from learner.frozen import FrozenAap, FrozenPrior
 from learner.hardware import Hardware
 from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
-from learner.sampling import ProposalPool
 from learner.training import Stage, TrainingResult, train
 from learner.where2act_adaptation import AdaptationStage
 from learner.where2act_interaction import InteractionStage
@@ -64,7 +64,7 @@ class Recipe:
     Attributes:
         config: the settings.
         policy: the modules.
-        dataset: the interactions.
+        known: the interactions, and features of them.
         parts: which to learn from, and which to judge by.
         runner: trains one network.
         oracle: what privileged training of AAP left, to teach further stages; None where there is none.
@@ -72,10 +72,15 @@ class Recipe:
 
     config: LearnerConfig
     policy: Policy
-    dataset: Dataset
+    known: FrozenFeatures
     parts: Split
     runner: Runner
     oracle: OracleCritic | None = None
+
+    @property
+    def dataset(self) -> Dataset:
+        """The interactions."""
+        return self.known.dataset
 
     def train(self, stage: ModuleName) -> TrainingResult:
         """Train one module of the policy; the others stay as they are."""
@@ -96,83 +101,77 @@ class Recipe:
         prior, config = self.policy.prior.requires_grad_(True), self.config.prior
         result = self.runner.train(PriorStage(prior, self.dataset, self.parts, config), config, "prior")
         prior.eval().requires_grad_(False)
-        pool = self._pool("prior")
-        affordance = AffordanceStage(
-            "prior-affordance", PriorAnswer(prior, pool), self.dataset, self.parts, config.affordance, pool
-        )
+        pool = self._pool()
+        affordance = self._affordance("prior", PriorCritic(prior, pool), config.affordance, pool)
         return self.runner.train_affordance(affordance, config.affordance, result)
 
     def _aap(self) -> TrainingResult:
-        aap, config, pool = self.policy.aap.requires_grad_(True), self.config.aap, self._pool("aap")
+        aap, config, pool = self.policy.aap.requires_grad_(True), self.config.aap, self._pool()
         # An AAP that has been trained has a z of its own, which a new oracle would only disturb; the old one may teach.
         trained, oracle = "aap" in self.policy.trained, self.oracle
         if config.training == "privileged" and not trained:
             oracle = self._oracle()
         teacher = self._teacher(oracle if config.training == "privileged" else None)
-        stage = AapStage(aap, self.dataset, self.parts, config, teacher, trained=trained)
+        stage = AapStage(aap, self.known, self.parts, config, teacher, trained=trained)
         result = self.runner.train(stage, config, "aap")
-        frozen = FrozenAap.of(aap, self.dataset, pool)
-        affordance = AffordanceStage(
-            "aap-affordance",
-            AapAnswer(frozen, config.top),
-            self.dataset,
-            self.parts,
-            config.affordance,
-            pool,
-            frozen,
-        )
+        frozen = FrozenAap.of(aap, self.known)
+        affordance = self._affordance("aap", AapCritic(frozen, config.top), config.affordance, pool, frozen)
         return self.runner.train_affordance(affordance, config.affordance, result)
 
     def _aip(self) -> TrainingResult:
-        aip, config, pool = self.policy.aip.requires_grad_(True), self.config.aip, self._pool("aip")
-        frozen = FrozenAap.of(self.policy.aap, self.dataset, pool)
+        aip, config, pool = self.policy.aip.requires_grad_(True), self.config.aip, self._pool()
+        frozen = FrozenAap.of(self.policy.aap, self.known)
         teacher = self._teacher(self.oracle if config.training == "inherited" else None)
         stage = AipStage(aip, self.dataset, self.parts, config, frozen, teacher)
         result = self.runner.train(stage, config, "aip")
         aip.eval().requires_grad_(False)
-        features = pool.features_under(aip.encoder, self.dataset.clouds)
-        answer = AipAnswer(aip, features, frozen, config.top)
-        affordance = AffordanceStage(
-            "aip-affordance", answer, self.dataset, self.parts, config.affordance, pool, frozen
-        )
+        critic = AipCritic(aip, self.known.pool(aip.encoder), frozen, config.top)
+        affordance = self._affordance("aip", critic, config.affordance, pool, frozen)
         return self.runner.train_affordance(affordance, config.affordance, result)
 
     def _interaction(self) -> TrainingResult:
         network, config = self.policy.where2act_interaction, self.config.interaction
         assert network is not None, "a baseline is begun before it is trained"
-        pool, prior = self._pool("where2act-interaction"), FrozenPrior.of(self.policy.prior, self.dataset)
+        pool, prior = self._pool(), FrozenPrior.of(self.policy.prior, self.known)
         stage = InteractionStage(network.requires_grad_(True), self.dataset, self.parts, config, prior)
         result = self.runner.train(stage, config, stage.name)
-        frozen = FrozenAap.of(network, self.dataset, pool)
+        frozen = FrozenAap.of(network, self.known)
         # The mean of all proposals' scores, as Where2Act has it, and not of the best.
-        answer = AapAnswer(frozen, config.affordance.proposals)
+        critic = AapCritic(frozen, config.affordance.proposals)
         settings = config.affordance.model_copy(update={"context": TRIES})
-        affordance = AffordanceStage(
-            f"{stage.name}-affordance",
-            answer,
-            self.dataset,
-            self.parts,
-            settings,
-            pool,
-            frozen,
-            order=stage.order,
-            shortest=TRIES,
-        )
+        affordance = self._affordance("where2act-interaction", critic, settings, pool, frozen, stage.order, TRIES)
         return self.runner.train_affordance(affordance, settings, result)
 
     def _adaptation(self) -> TrainingResult:
         network, config = self.policy.where2act_adaptation, self.config.adaptation
         assert network is not None, "a baseline is begun before it is trained"
-        prior = FrozenPrior.of(self.policy.prior, self.dataset)
+        prior = FrozenPrior.of(self.policy.prior, self.known)
         stage = AdaptationStage(network.requires_grad_(True), self.dataset, self.parts, config, prior)
         return self.runner.train(stage, config, stage.name)
 
-    def _pool(self, stage: ModuleName) -> ProposalPool:
-        return ProposalPool.of(self.dataset, self.policy.prior, generator(self.config.seed, f"learner.{stage}.pool"))
+    def _affordance(
+        self,
+        stage: ModuleName,
+        critic: Critic,
+        config: AffordanceConfig,
+        pool: ProposalPool,
+        frozen: FrozenAap | None = None,
+        order: RowOrder | None = None,
+        shortest: int = 0,
+    ) -> AffordanceStage:
+        """The stage that trains a module's D, when its critic is done."""
+        rng = generator(self.config.seed, f"learner.{stage}.questions")
+        name = f"{stage}-affordance"
+        return AffordanceStage(
+            name, critic, self.dataset, self.parts, config, pool, rng, frozen=frozen, order=order, shortest=shortest
+        )
+
+    def _pool(self) -> ProposalPool:
+        return ProposalPool.of(self.policy.prior, self.known)
 
     def _teacher(self, oracle: OracleCritic | None) -> Teacher | None:
-        """What the oracle says of all rows, whose clouds it has to encode for that; nothing where there is none."""
-        return None if oracle is None else Teacher.of(oracle, self.dataset)
+        """What the oracle says of all rows; nothing where there is none."""
+        return None if oracle is None else Teacher.of(oracle, self.known)
 
     def _oracle(self) -> OracleCritic:
         """Train the oracle critic, save it, and start AAP from it."""

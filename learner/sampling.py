@@ -1,6 +1,6 @@
 """Batches: which rows are context, which are asked about, and which clouds that needs.
 
-Shapes: B ordered sets of interactions, n rows of each (padded), K the longest context, Q points, S proposals.
+Shapes: B ordered sets of interactions, n rows of each (padded), K the longest context.
 """
 
 from collections.abc import Sequence
@@ -14,12 +14,6 @@ from torch import Tensor
 from learner.augmentation import turn_facts, turn_vectors
 from learner.data import Dataset
 from shared.networks.pointnet2 import CloudBatch, PointNet2
-from shared.networks.prior import Prior
-
-ENCODING_CHUNK = 16
-"""Clouds encoded at once where no gradient is needed; bounds memory."""
-POOL_POINTS = 16
-"""Movable points of each cloud that proposals are drawn at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,70 +137,6 @@ class Batch:
         """What is known of the rows' points, [B, n, point_width]; each cloud is encoded once."""
         flat = encoder.at(encoder(self.clouds), self.cloud.flatten(), self.point.flatten())
         return flat.reshape(*self.point.shape, -1)
-
-
-@dataclass(frozen=True, slots=True)
-class ProposalPool:
-    """A few movable points of each cloud with their features under the frozen prior, to draw proposals at.
-
-    Attributes:
-        point: [O, P], index in the cloud.
-        features: [O, P, point_width], of the prior.
-        prior: whose proposal network draws.
-    """
-
-    point: Tensor
-    features: Tensor
-    prior: Prior
-
-    @classmethod
-    def of(cls, dataset: Dataset, prior: Prior, rng: np.random.Generator) -> "ProposalPool":
-        """Draw the points once for all of a training stage, since the prior does not change in it."""
-        chosen = []
-        for movable in dataset.movable.numpy(force=True):
-            candidates = np.flatnonzero(movable) if movable.any() else np.arange(len(movable))
-            chosen.append(rng.choice(candidates, POOL_POINTS))
-        point = torch.as_tensor(np.stack(chosen))
-        return cls(point, _features_of_all(prior.encoder, dataset.clouds, point), prior)
-
-    def features_under(self, encoder: PointNet2, clouds: CloudBatch) -> Tensor:
-        """The points' features under another frozen encoder, [O, P, point_width]."""
-        return _features_of_all(encoder, clouds, self.point)
-
-    @torch.no_grad()
-    def draw(self, cloud: Tensor, slot: Tensor, count: int, rng: np.random.Generator) -> Tensor:
-        """`count` rotations at points of the pool, given by cloud and slot, [Q] each; [Q, count, 6]."""
-        noise = rng.standard_normal((len(cloud), count, self.prior.config.noise_width)).astype(np.float32)
-        return self.prior.propose(self.features[cloud, slot][:, None], torch.as_tensor(noise))
-
-
-@torch.no_grad()
-def frozen_features(encoder: PointNet2, clouds: CloudBatch, cloud: Tensor, point: Tensor) -> Tensor:
-    """Features of points under an encoder that is not trained, [Q, point_width]; each cloud is encoded once.
-
-    Args:
-        encoder: in evaluation mode for the duration.
-        clouds: all clouds.
-        cloud: [Q], which of them.
-        point: [Q].
-    """
-    was_training = encoder.training
-    encoder.eval()
-    features = torch.empty(len(cloud), encoder.width)
-    needed, inverse = torch.unique(cloud, return_inverse=True)
-    for start in range(0, len(needed), ENCODING_CHUNK):
-        chunk = needed[start : start + ENCODING_CHUNK]
-        here = torch.nonzero((inverse >= start) & (inverse < start + len(chunk))).flatten()
-        encoded = encoder(clouds.select(chunk))
-        features[here] = encoder.at(encoded, inverse[here] - start, point[here])
-    encoder.train(was_training)
-    return features
-
-
-def _features_of_all(encoder: PointNet2, clouds: CloudBatch, point: Tensor) -> Tensor:
-    """Features of the same number of points of every cloud, [O, P] to [O, P, point_width]."""
-    cloud = torch.arange(len(point))[:, None].expand_as(point)
-    return frozen_features(encoder, clouds, cloud.flatten(), point.flatten()).reshape(*point.shape, -1)
 
 
 def spread(numbers: Sequence[int], most: int) -> list[int]:

@@ -24,6 +24,7 @@ from learner import sharing
 from learner.checkpoint import check_fingerprint, read_cursor
 from learner.configuration import LearnerConfig
 from learner.data import Dataset, Split, load_dataset, split, without_later
+from learner.features import FrozenFeatures
 from learner.hardware import Hardware
 from learner.names import METRICS_FILE
 from learner.oracle import read_oracle
@@ -39,7 +40,7 @@ from shared.policy import (
     WEIGHTS_FILE,
     Policy,
 )
-from shared.seeds import torch_seed
+from shared.seeds import generator, torch_seed
 from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
@@ -143,7 +144,8 @@ def _train(
     with hardware.home():
         runner = Runner(job.out, config.seed, fingerprint, hardware)
         told = None if oracle is None else read_oracle(oracle, policy.config).to(hardware.device)
-        result = Recipe(config, policy, dataset.on(hardware.device), parts, runner, told).train(job.stage)
+        known = FrozenFeatures.with_pool(dataset.on(hardware.device), generator(config.seed, "learner.pool"))
+        result = Recipe(config, policy, known, parts, runner, told).train(job.stage)
     policy.modules().to("cpu")
     policy.with_trained(job.stage)
     if sharing.rank() == 0:

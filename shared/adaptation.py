@@ -18,7 +18,7 @@ from torch import Tensor
 
 from shared.errors import UsageError
 from shared.geometry import gripper_rotation, points_in_view, view_from_world
-from shared.grouping import group_cloud
+from shared.grouping import group_cloud, nearest_points
 from shared.networks.aap import Aap
 from shared.networks.actions import middle_of
 from shared.networks.pointnet2 import CloudBatch, EncodedClouds, PointNet2
@@ -40,6 +40,7 @@ class _Entry:
 
     observation: Observation
     clouds: CloudBatch
+    around: NDArray[np.int16]
     middle: Tensor
     encoded: dict[str, EncodedClouds]
 
@@ -98,14 +99,15 @@ class Adapter:
     ) -> Float32:
         """A_I: the AAP actionability of every point after a history, [N], in [0, 1]."""
         everywhere = np.arange(len(observation.points))
-        features, places = self.seen(observation, module, everywhere), self.places(observation, everywhere)
+        features, places = self.features(observation, module, everywhere), self.places(observation, everywhere)
         return self._adaptive(module).actionability(features, places, self.z(history, module)).numpy()
 
     @torch.inference_mode()
     def prior_affordance(self, observation: Observation) -> Float32:
         """A: Where2Act's actionability of every point, [N], in [0, 1]."""
-        features = self.seen(observation, "prior", np.arange(len(observation.points)))
-        return self.policy.prior.actionability(features).numpy()
+        everywhere = np.arange(len(observation.points))
+        features, places = self.features(observation, "prior", everywhere), self.places(observation, everywhere)
+        return self.policy.prior.actionability(features, places).numpy()
 
     @torch.inference_mode()
     def score(
@@ -132,15 +134,12 @@ class Adapter:
 
     @torch.inference_mode()
     def features(self, observation: Observation, module: EncoderName, points: NDArray[np.int64]) -> Tensor:
-        """All that a module knows of points where actions are judged, [len(points), point_width]."""
-        index = torch.from_numpy(points)
-        return self._encoder(module).at(self.encode(observation, module), torch.zeros_like(index), index)
-
-    @torch.inference_mode()
-    def seen(self, observation: Observation, module: EncoderName, points: NDArray[np.int64]) -> Tensor:
-        """f_p|O of a module at points of a cloud, [len(points), feature_width]; cheaper, and enough without actions."""
-        index = torch.from_numpy(points)
-        return self._encoder(module).features_at(self.encode(observation, module), torch.zeros_like(index), index)
+        """All that a module knows of points, [len(points), point_width]."""
+        index, entry = torch.from_numpy(points), self._entry(observation)
+        features = self._encoder(module).features_at(self.encode(observation, module), torch.zeros_like(index), index)
+        around = torch.from_numpy(entry.around[points].astype(np.int64))
+        offsets = entry.clouds.points[0, around] - entry.clouds.points[0, index][:, None]
+        return torch.cat([features, offsets.flatten(1)], dim=-1)
 
     def places(self, observation: Observation, points: NDArray[np.int64]) -> Tensor:
         """Places as actions are told them: p less the middle of what may be moved, [len(points), 3]."""
@@ -151,7 +150,7 @@ class Adapter:
     def proposals(self, observation: Observation, point: int, rng: np.random.Generator) -> Proposals:
         """Rotations at a point, from the prior's Action Proposal Network."""
         noise = rng.standard_normal((PROPOSALS, self.policy.config.noise_width)).astype(np.float32)
-        features = self.seen(observation, "prior", np.array([point]))
+        features = self.features(observation, "prior", np.array([point]))
         return Proposals(point, self.policy.prior.propose(features, torch.from_numpy(noise)))
 
     @torch.inference_mode()
@@ -184,9 +183,9 @@ class Adapter:
     def information(self, observation: Observation, points: NDArray[np.int64], latent: Tensor) -> Float32:
         """The AIP actionability a^AIP_p|z of the points at the indices `points`, [len(points)]."""
         places = self.places(observation, points)
-        expected = self.policy.aap.actionability(self.seen(observation, "aap", points), places, latent)
-        features = self.seen(observation, "aip", points)
-        return self.policy.aip.actionability(features, latent, expected).numpy()
+        expected = self.policy.aap.actionability(self.features(observation, "aap", points), places, latent)
+        features = self.features(observation, "aip", points)
+        return self.policy.aip.actionability(features, places, latent, expected).numpy()
 
     def _entry(self, observation: Observation) -> _Entry:
         entry = self._entries.get(id(observation))
@@ -194,7 +193,8 @@ class Adapter:
             points = points_in_view(observation)
             clouds = CloudBatch.of([points], [group_cloud(points, self.policy.config)])
             middle = middle_of(clouds.points[0], torch.from_numpy(observation.movable))
-            entry = self._entries[id(observation)] = _Entry(observation, clouds, middle, {})
+            around = nearest_points(points, self.policy.config.surroundings)
+            entry = self._entries[id(observation)] = _Entry(observation, clouds, around, middle, {})
             if len(self._entries) > MAX_CACHED_OBSERVATIONS:
                 self._entries.popitem(last=False)
         self._entries.move_to_end(id(observation))

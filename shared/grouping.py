@@ -61,6 +61,16 @@ def group_cloud(points: Float32, config: NetworkConfig) -> Grouping:
     return Grouping(tuple(neighbours), tuple(nearest))
 
 
+def nearest_points(points: Float32, count: int) -> Indices:
+    """The `count` nearest of a cloud's points to each of them, [N, count]; too few repeat the farthest.
+
+    The same as `shared.networks.pointnet2.surroundings` finds for single points of many clouds.
+    """
+    ranks = np.arange(1, min(count, len(points)) + 1)
+    found = np.asarray(cKDTree(points).query(points, k=ranks)[1]) if count else np.zeros((len(points), 0))
+    return np.pad(found, ((0, 0), (0, count - len(ranks))), mode="edge" if count else "empty").astype(np.int16)
+
+
 def _within(points: Float32, centres: Float32, count: int, radius: float) -> Indices:
     """The `count` nearest of `points` within `radius` of each centre, [n, count]."""
     _, found = cKDTree(points).query(centres, k=np.arange(1, count + 1), distance_upper_bound=radius)

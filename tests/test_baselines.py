@@ -13,6 +13,7 @@ from learner.configuration import AdaptationConfig, InteractionConfig, LearnerCo
 from learner.critics import OracleScores, row_critic
 from learner.data import Dataset, load_dataset
 from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD, evaluate, evaluate_store
+from learner.features import FrozenFeatures
 from learner.frozen import FrozenPrior
 from learner.oracle import OracleCritic, read_oracle
 from learner.prior import PriorStage
@@ -61,7 +62,7 @@ def coin_dataset(dataset: Dataset) -> Dataset:
 def stage_of(name: BaselineName, dataset: Dataset, policy: Policy) -> InteractionStage | AdaptationStage:
     policy.begin_baseline(name, 0)
     policy.modules().requires_grad_(False)
-    prior = FrozenPrior.of(policy.prior.eval(), dataset)
+    prior = FrozenPrior.of(policy.prior.eval(), FrozenFeatures(dataset))
     if name == "where2act-interaction":
         assert policy.where2act_interaction is not None
         network = policy.where2act_interaction.requires_grad_(True)
@@ -236,7 +237,7 @@ def test_rows_are_judged_as_they_would_be_seen(trained: Path, dataset: Dataset) 
         seen = critic_named(name, Adapter(policy)).predict(
             record.observations[asked.observation], [asked.action], history
         )
-        stored = row_critic(name, policy, dataset)(index[5:6], index[:4])
+        stored = row_critic(name, policy, FrozenFeatures(dataset))(index[5:6], index[:4])
         np.testing.assert_allclose(seen, stored.numpy(), atol=1e-4, err_msg=name)
 
 
@@ -244,7 +245,7 @@ def test_an_oracle_comes_back_and_a_hostile_one_is_refused(trained: Path, datase
     path = trained / "aap" / ORACLE_FILE
     oracle = read_oracle(path, TINY)
     assert isinstance(oracle, OracleCritic)
-    scores = OracleScores(oracle, dataset)(torch.arange(5), torch.arange(0))
+    scores = OracleScores(oracle, FrozenFeatures(dataset))(torch.arange(5), torch.arange(0))
     assert ((scores > 0) & (scores < 1)).all()
     (tmp_path / "cut").write_bytes(path.read_bytes()[:-9])
     with pytest.raises(StoreError, match="safetensors"):
@@ -257,7 +258,7 @@ def test_the_prior_is_what_its_own_stage_says(dataset: Dataset) -> None:
     policy = Policy.untrained("push", TINY, 0)
     index = torch.arange(10)
     stage = PriorStage(policy.prior, dataset, EVERYTHING, ALL.prior)
-    torch.testing.assert_close(stage.scores(index), FrozenPrior.of(policy.prior, dataset).scores[index])
+    torch.testing.assert_close(stage.scores(index), FrozenPrior.of(policy.prior, FrozenFeatures(dataset)).scores[index])
 
 
 def test_an_unknown_method_in_a_store_is_refused(trained: Path, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from shared.grouping import group_cloud
+from shared.grouping import group_cloud, nearest_points
 from shared.networks.aap import Aap
 from shared.networks.actions import MOMENT_SCALE, action_inputs, geodesic_distance, in_gripper, orthonormal_frames
 from shared.networks.configuration import NETWORKS, NetworkConfig
@@ -133,7 +133,18 @@ def test_surroundings_are_the_nearest_points_and_turn_with_the_gripper() -> None
     assert surroundings(batch.points[:, :4], cloud, batch.points[cloud, 0], 6).shape == (3, 6, 3)
 
 
-def test_actions_are_told_what_lies_around_and_nobody_else_is() -> None:
+@given(st.integers(1, 40), st.integers(0, 12), st.integers(0, 1000))
+@settings(max_examples=25, deadline=None)
+def test_a_whole_clouds_surroundings_are_those_of_its_points(size: int, count: int, seed: int) -> None:
+    points = torch.randn(1, size, 3, generator=torch.Generator().manual_seed(seed))
+    around = nearest_points(points[0].numpy(), count).astype(np.int64)
+    assert around.shape == (size, count)
+    if count:
+        alone = surroundings(points, torch.zeros(size, dtype=torch.long), points[0], count)
+        torch.testing.assert_close(points[0][around] - points[0][:, None], alone)
+
+
+def test_critics_and_affordance_networks_are_told_what_lies_around() -> None:
     module, batch = Prior(TINY), clouds(1)
     cloud, point = torch.zeros(3, dtype=torch.long), torch.arange(3)
     encoded = module.encoder(batch)
@@ -141,11 +152,14 @@ def test_actions_are_told_what_lies_around_and_nobody_else_is() -> None:
     alone = module.encoder.features_at(encoded, cloud, point)
     assert known.shape == (3, TINY.point_width)
     assert torch.equal(point_features(known, TINY), alone)
-    assert torch.equal(module.actionability(known), module.actionability(alone))
-    frames = orthonormal_frames(torch.randn(3, 6))
+    frames, points = orthonormal_frames(torch.randn(3, 6)), batch.points[0, :3]
     elsewhere = torch.cat([alone, torch.rand(3, 3 * TINY.surroundings)], dim=-1)
-    scores = [module.action_logits(features, batch.points[0, :3], frames) for features in (known, elsewhere)]
+    scores = [module.action_logits(features, points, frames) for features in (known, elsewhere)]
     assert not torch.allclose(*scores)
+    assert not torch.allclose(*(module.actionability(features, points) for features in (known, elsewhere)))
+    # Which rotations are worth trying is asked of the features alone, as published.
+    noise = torch.randn(3, 4, TINY.noise_width)
+    assert torch.equal(*(module.propose(features[:, None], noise) for features in (known, elsewhere)))
 
 
 def codes(module: Aap, count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -22,6 +22,7 @@ from learner.aap import AapStage, OracleStage
 from learner.aip import AipStage
 from learner.configuration import LearnerConfig, TrainingConfig
 from learner.data import Dataset, Split, load_dataset, split
+from learner.features import FrozenFeatures
 from learner.frozen import FrozenAap
 from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
@@ -132,16 +133,17 @@ def stages_of(dataset: Dataset, parts: Split, config: LearnerConfig) -> list[tup
     "aap" is trained end to end, clouds encoded in the step, as the port's is, whatever the configuration says.
     """
     policy, other = (Policy.untrained(dataset.task, config.network, config.seed) for _ in range(2))
-    frozen = FrozenAap.of(Policy.untrained(dataset.task, config.network, config.seed).aap, dataset)
+    known = FrozenFeatures(dataset)
+    frozen = FrozenAap.of(Policy.untrained(dataset.task, config.network, config.seed).aap, known)
     oracle = OracleCritic(Policy.untrained(dataset.task, config.network, config.seed).aap)
-    teacher = Teacher.of(OracleCritic(Policy.untrained(dataset.task, config.network, config.seed).aap), dataset)
+    teacher = Teacher.of(OracleCritic(Policy.untrained(dataset.task, config.network, config.seed).aap), known)
     paper = config.aap.model_copy(update={"training": "paper", "batch_rollouts": config.aap.oracle_batch_rollouts})
     told = config.aap.model_copy(update={"training": "privileged"})
     stages: list[tuple[Stage, TrainingConfig]] = [
         (PriorStage(policy.prior, dataset, parts, config.prior), config.prior),
-        (AapStage(policy.aap, dataset, parts, paper), paper),
+        (AapStage(policy.aap, known, parts, paper), paper),
         (OracleStage(oracle, dataset, parts, told), told),
-        (AapStage(other.aap, dataset, parts, told, teacher), told),
+        (AapStage(other.aap, known, parts, told, teacher), told),
         (AipStage(policy.aip, dataset, parts, config.aip, frozen), config.aip),
     ]
     return [(name, *stage) for name, stage in zip(NETWORKS, stages, strict=True)]

@@ -13,7 +13,7 @@ from shared.errors import UsageError
 if TYPE_CHECKING:
     from cluster.curves import Curves
     from learner.curve import Answers, Candidates, ProposalGain
-    from learner.data import Dataset
+    from learner.features import FrozenFeatures
     from shared.policy import Policy
 
 
@@ -82,6 +82,7 @@ def _judge(command: CurveCommand, runs: dict[str, list[Path]]) -> "Curves":
     from learner.comparison import curve_rows
     from learner.curve import Candidates
     from learner.data import load_dataset
+    from learner.features import FrozenFeatures
     from learner.stages import objects_seen, read_policy_folder
     from shared.store.store import Store
 
@@ -101,13 +102,13 @@ def _judge(command: CurveCommand, runs: dict[str, list[Path]]) -> "Curves":
     candidates = Candidates.of(dataset, rollouts, command.draws, command.seed)
     if candidates.count < max(command.tries):
         raise UsageError(f"--tries {max(command.tries)}: the store's rollouts leave {candidates.count} to try")
-    rows, gains = [], {}
+    known, rows, gains = FrozenFeatures(dataset), [], {}
     for name, found in trained.items():
         answers = []
         for place, (run, policy) in enumerate(zip(found, policies[name], strict=True)):
             others = [all_[place].oracle for all_ in trained.values() if place < len(all_)]
             oracle = next((path for path in [run.oracle, *others] if path is not None), None)
-            answered, gained = _answers(dataset, candidates, policy, oracle, command.tries, gains=name not in gains)
+            answered, gained = _answers(known, candidates, policy, oracle, command.tries, gains=name not in gains)
             answers.append((str(place + 1), answered))
             if gained:
                 gains[name] = gained
@@ -142,7 +143,7 @@ def _check(policies: "list[Policy]", task: str) -> None:
 
 
 def _answers(
-    dataset: "Dataset",
+    known: "FrozenFeatures",
     candidates: "Candidates",
     policy: "Policy",
     oracle: Path | None,
@@ -156,8 +157,8 @@ def _answers(
     from learner.oracle import read_oracle
 
     policy.modules().eval().requires_grad_(False)
-    frozen = FrozenAap.of(policy.aap, dataset)
+    frozen = FrozenAap.of(policy.aap, known)
     aip = policy.aip if "aip" in policy.trained else None
     told = None if oracle is None else read_oracle(oracle, policy.config)
-    answered = answer(dataset, candidates, frozen, policy.prior, aip, told, tries)
-    return answered, proposal_gains(dataset, candidates, frozen, aip) if gains and aip is not None else []
+    answered = answer(known, candidates, frozen, policy.prior, aip, told, tries)
+    return answered, proposal_gains(known, candidates, frozen, aip) if gains and aip is not None else []

@@ -4,9 +4,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shared.networks.actions import PLACE_SCALE, outcome_inputs, outcome_width
+from shared.networks.actions import outcome_inputs, outcome_width
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import ActionEncoder, Head, VectorEncoder, point_features
+from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features
 from shared.networks.pointnet2 import PointNet2
 
 MIN_ATTENTION = 1e-4
@@ -34,8 +34,8 @@ class Aap(nn.Module):
         self.evidence_head = Head((latent, latent), latent, config) if config.evidence else None
         self.empty_latent = nn.Parameter(torch.zeros(latent))
         self.critic_head = Head((width, width, latent), 1, config, product=config.products)
-        self.place_encoder = VectorEncoder(3, config) if config.action_features else None
-        place = (width,) if config.action_features else ()
+        self.place_encoder = PlaceEncoder.where_told(config)
+        place = () if self.place_encoder is None else (width,)
         self.affordance_head = Head((width, *place, latent), 1, config, product=config.products)
 
     def interaction_codes(
@@ -106,11 +106,12 @@ class Aap(nn.Module):
     def actionability(self, features: Tensor, points: Tensor, latents: Tensor) -> Tensor:
         """AAP actionability a_p|z in [0, 1] (AdaAfford, Adaptive Affordance Network), [...]; leading axes broadcast.
 
-        Deviation: where actions enter with p, D is told p too, since what its critic scores turns on lever arms.
+        Arguments as for `action_logits`; for what D is told beyond the paper see `PlaceEncoder`.
         """
-        inputs = [point_features(features, self.config).detach(), latents.detach()]
+        features = features.detach()
+        inputs = [point_features(features, self.config), latents.detach()]
         if self.place_encoder is not None:
-            inputs.insert(1, self.place_encoder(PLACE_SCALE * points))
+            inputs.insert(1, self.place_encoder(features, points))
         logits: Tensor = self.affordance_head(*inputs)
         return torch.sigmoid(logits.squeeze(-1))
 

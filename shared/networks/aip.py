@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import ActionEncoder, Head, VectorEncoder, point_features
+from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features
 from shared.networks.pointnet2 import PointNet2
 
 SCORE_SCALE = 0.02
@@ -26,7 +26,9 @@ class Aip(nn.Module):
         self.score_encoder = VectorEncoder(1, config)
         self.actionability_encoder = VectorEncoder(1, config)
         self.critic_head = Head((width, width, width, latent), 1, config, product=config.products)
-        self.affordance_head = Head((width, width, latent), 1, config)
+        self.place_encoder = PlaceEncoder.where_told(config)
+        place = () if self.place_encoder is None else (width,)
+        self.affordance_head = Head((width, *place, width, latent), 1, config)
 
     def action_scores(
         self, features: Tensor, points: Tensor, frames: Tensor, latents: Tensor, aap_scores: Tensor
@@ -45,14 +47,25 @@ class Aip(nn.Module):
         scores: Tensor = self.critic_head(features, self.score_encoder(aap_scores[..., None]), actions, latents)
         return SCORE_SCALE * scores.squeeze(-1)
 
-    def actionability(self, features: Tensor, latents: Tensor, aap_actionability: Tensor) -> Tensor:
+    def actionability(self, features: Tensor, points: Tensor, latents: Tensor, aap_actionability: Tensor) -> Tensor:
         """AIP actionability a^AIP_p|z of points (AdaAfford, AIP Affordance Network), [...].
 
         Args:
             features: of points under this module's encoder, [..., point_width].
+            points: p less the middle of what may be moved, [..., 3].
             latents: z, [..., latent_width].
             aap_actionability: a^AAP_p|z in [0, 1], [...].
         """
-        encoded = self.actionability_encoder(aap_actionability[..., None])
-        scores: Tensor = self.affordance_head(point_features(features, self.config).detach(), encoded, latents)
+        features = features.detach()
+        inputs = [point_features(features, self.config)]
+        if self.place_encoder is not None:
+            inputs.append(self.place_encoder(features, points))
+        scores: Tensor = self.affordance_head(
+            *inputs, self.actionability_encoder(aap_actionability[..., None]), latents
+        )
         return SCORE_SCALE * scores.squeeze(-1)
+
+    def affordance_network(self) -> nn.Module:
+        """All that D has of its own."""
+        own = {"head": self.affordance_head, "believed": self.actionability_encoder}
+        return nn.ModuleDict(own if self.place_encoder is None else own | {"place": self.place_encoder})

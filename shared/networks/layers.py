@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shared.networks.actions import action_inputs, action_width, in_gripper
+from shared.networks.actions import PLACE_SCALE, action_inputs, action_width, in_gripper
 from shared.networks.configuration import NetworkConfig
 
 SURROUNDINGS_SCALE = 10.0
@@ -59,19 +59,31 @@ class VectorEncoder(nn.Module):
         return _as_tensor(self.second(functional.leaky_relu(self.first(x))))
 
 
+class SurroundingsEncoder(nn.Module):
+    """Encodes the points around p: each through a small perceptron, of which the maximum counts, as in PointNet."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.each = PointwiseMlp(3, (32, 64), "none")
+        self.together = VectorEncoder(64, config)
+
+    def forward(self, offsets: Tensor) -> Tensor:
+        """Offsets from p, [..., k, 3], to [..., feature_width]."""
+        return _as_tensor(self.together(self.each(SURROUNDINGS_SCALE * offsets).amax(dim=-2)))
+
+
 class ActionEncoder(nn.Module):
     """Encodes an action at a point into f_a (AdaAfford, Input Encoders).
 
     Deviation, where `config.surroundings` is set: the points around p are told as the gripper sees them, in its own
-    frame, each through a small perceptron, of which the maximum counts, as in PointNet.
+    frame.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
         self.numbers = VectorEncoder(action_width(config), config)
-        self.each = PointwiseMlp(3, (32, 64), "none") if config.surroundings else None
-        self.together = VectorEncoder(64, config) if config.surroundings else None
+        self.around = SurroundingsEncoder(config) if config.surroundings else None
 
     def forward(self, features: Tensor, points: Tensor, frames: Tensor) -> Tensor:
         """Actions to [..., feature_width]; leading axes broadcast.
@@ -82,12 +94,43 @@ class ActionEncoder(nn.Module):
             frames: approach and forward, [..., 6].
         """
         encoded = _as_tensor(self.numbers(action_inputs(points, frames, self.config)))
-        if self.each is None or self.together is None:
+        if self.around is None:
             return encoded
-        around = features[..., self.config.feature_width :]
-        offsets = around.reshape(*around.shape[:-1], self.config.surroundings, 3)
-        seen = SURROUNDINGS_SCALE * in_gripper(offsets, frames)
-        return encoded + _as_tensor(self.together(self.each(seen).amax(dim=-2)))
+        return encoded + _as_tensor(self.around(in_gripper(surrounding_offsets(features, self.config), frames)))
+
+
+class PlaceEncoder(nn.Module):
+    """Encodes what a D network is told of a point beside f_p|O; the published networks are told nothing more.
+
+    Deviation: D follows a critic, and has to know what its critic knows: p, where actions enter with it, since scores
+    turn on lever arms, and the points around p, where actions are told them, here in the view frame.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.place = VectorEncoder(3, config) if config.action_features else None
+        self.around = SurroundingsEncoder(config) if config.surroundings else None
+
+    @classmethod
+    def where_told(cls, config: NetworkConfig) -> "PlaceEncoder | None":
+        """One, where there is something to encode."""
+        return cls(config) if config.action_features or config.surroundings else None
+
+    def forward(self, features: Tensor, points: Tensor) -> Tensor:
+        """All that is known of points, [..., point_width], and p less the middle, [..., 3]; [..., feature_width]."""
+        told = []
+        if self.place is not None:
+            told.append(_as_tensor(self.place(PLACE_SCALE * points)))
+        if self.around is not None:
+            told.append(_as_tensor(self.around(surrounding_offsets(features, self.config))))
+        return torch.stack(told).sum(dim=0)
+
+
+def surrounding_offsets(features: Tensor, config: NetworkConfig) -> Tensor:
+    """Offsets of the points around p, [..., surroundings, 3], of all that is known of points, [..., point_width]."""
+    around = features[..., config.feature_width :]
+    return around.reshape(*around.shape[:-1], config.surroundings, 3)
 
 
 def point_features(features: Tensor, config: NetworkConfig) -> Tensor:

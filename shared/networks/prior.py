@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from shared.networks.actions import FRAME_WIDTH, orthonormal_frames
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import ActionEncoder, Head, point_features
+from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, point_features
 from shared.networks.pointnet2 import PointNet2
 
 
@@ -24,7 +24,9 @@ class Prior(nn.Module):
         self.action_encoder = ActionEncoder(config)
         self.proposal_head = Head((width, config.noise_width), FRAME_WIDTH, config)
         self.critic_head = Head((width, width), 1, config)
-        self.affordance_head = Head((width,), 1, config)
+        self.place_encoder = PlaceEncoder.where_told(config)
+        place = () if self.place_encoder is None else (width,)
+        self.affordance_head = Head((width, *place), 1, config)
 
     def propose(self, features: Tensor, noise: Tensor) -> Tensor:
         """Rotations at points (Where2Act, Action Proposal Network).
@@ -49,9 +51,17 @@ class Prior(nn.Module):
         actions = self.action_encoder(features, points, frames)
         return _single(self.critic_head(point_features(features, self.config), actions))
 
-    def actionability(self, features: Tensor) -> Tensor:
-        """Actionability a_p in [0, 1] of points with features [..., point_width] (Where2Act), [...]."""
-        return torch.sigmoid(_single(self.affordance_head(point_features(features, self.config))))
+    def actionability(self, features: Tensor, points: Tensor) -> Tensor:
+        """Actionability a_p in [0, 1] (Where2Act), [...]; features and points as for `action_logits`."""
+        inputs = [point_features(features, self.config)]
+        if self.place_encoder is not None:
+            inputs.append(self.place_encoder(features, points))
+        return torch.sigmoid(_single(self.affordance_head(*inputs)))
+
+    def affordance_network(self) -> nn.Module:
+        """All that D has of its own."""
+        own = {"head": self.affordance_head}
+        return nn.ModuleDict(own if self.place_encoder is None else own | {"place": self.place_encoder})
 
 
 def _single(x: Tensor) -> Tensor:

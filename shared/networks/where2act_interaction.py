@@ -26,4 +26,6 @@ class Where2ActInteraction(Aap):
         network.action_encoder.load_state_dict(prior.action_encoder.state_dict())
         network.critic_head.start_from(prior.critic_head)
         network.affordance_head.start_from(prior.affordance_head)
+        if network.place_encoder is not None and prior.place_encoder is not None:
+            network.place_encoder.load_state_dict(prior.place_encoder.state_dict())
         return network
