@@ -131,7 +131,8 @@ class Killer:
         living = sorted(self.marked.in_role(role), key=lambda process: process.pid)
         victims = living if role is Role.ALL else living[int(which * len(living)) :][:1]
         own = {command.pid: number for number, command in self._running.items()}
-        self._excused |= set(own.values()) if role in DEPENDED_ON else {own[v.pid] for v in victims if v.pid in own}
+        struck = {pid for victim in victims for pid in (victim.pid, _asked_by(victim, role))}
+        self._excused |= set(own.values()) if role in DEPENDED_ON else {own[pid] for pid in struck if pid in own}
         if not sum(map(end, victims)):
             self._note(f"no {role} lives")
             return None
@@ -143,6 +144,14 @@ class Killer:
     def _note(self, event: str) -> None:
         self.events.append(f"{time.strftime('%H:%M:%S')} {event}")
         (self.folder / "events.txt").write_text("\n".join([*self.events, ""]))
+
+
+def _asked_by(victim: psutil.Process, role: Role) -> int | None:
+    """The command that had a learner trained, and ends with it: it says so, and is given again by whoever wants to."""
+    try:
+        return victim.ppid() if role is Role.LEARNER else None
+    except psutil.NoSuchProcess:
+        return None
 
 
 def await_last_breath(everybody: Sequence[Marked]) -> None:
