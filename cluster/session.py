@@ -10,7 +10,7 @@ from typing import Any
 
 from cluster.fleet import Fleet, SerialFleet, WorkerFactory
 from collector.guard import Limits
-from shared.errors import UsageError
+from shared.errors import UsageError, WorkerError
 from shared.underway import Underway
 
 OBJECT_STORE_BYTES = 128 << 20
@@ -68,6 +68,7 @@ def ray_session(workers: int, address: str | None = None) -> Iterator[None]:
 
     Raises:
         UsageError: there is no cluster at `address`.
+        WorkerError: a session of our own does not come up; Ray allows it 30 s, too few for a machine under heavy load.
     """
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     on_terminate = signal.getsignal(signal.SIGTERM)
@@ -116,6 +117,10 @@ def _start_on_loopback(workers: int) -> None:
             log_to_driver=False,
             _node_ip_address="127.0.0.1",
         )
+    except Exception as error:
+        # Ray has no class of its own for a session that does not come up in its 30 s.
+        said = str(error).partition("\n")[0]
+        raise WorkerError(f"Ray did not start ({said}); run the same command again, or with --workers 0") from error
     finally:
         ray_constants.ENABLE_RAY_CLUSTER = clusters
 

@@ -19,11 +19,11 @@ from cluster.fleet import Fleet, SerialFleet
 from cluster.orders import Listed, Order
 from cluster.ray_fleet import RayFleet
 from cluster.seats import IN_FLIGHT
-from cluster.session import fleets
+from cluster.session import fleets, ray_session
 from collector.guard import Limits
 from collector.receipt import Receipt
 from shared.configuration import CollectionConfig
-from shared.errors import StoreError
+from shared.errors import StoreError, WorkerError
 from shared.plan import Job, ObjectRef, Plan, Setting, missing_jobs
 from shared.underway import Underway
 from tests.fake_worker import FakeWorker
@@ -336,3 +336,12 @@ def calls_a_shard(fleet: RayFleet, actors: int, shards: int = 1500) -> float:
     finally:
         sys.setprofile(None)
     return calls / shards
+
+
+def test_a_session_that_does_not_come_up_is_said_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def late(**settings: object) -> None:
+        raise Exception("The current node timed out during startup.\nraylet failed")
+
+    monkeypatch.setattr("ray.init", late)
+    with pytest.raises(WorkerError, match=r"timed out during startup\.\); run the same command again"), ray_session(1):
+        pass
