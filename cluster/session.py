@@ -6,6 +6,7 @@ import signal
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
 from typing import Any
 
 from cluster.fleet import Fleet, SerialFleet, WorkerFactory
@@ -42,6 +43,9 @@ def fleets(workers: int, limits: Limits, address: str | None = None) -> Iterator
         workers: how many actors a fleet has; 0 does without Ray.
         limits: what a rollout may take.
         address: of a running Ray cluster; None starts a session of our own on this machine.
+
+    Raises:
+        UsageError: as soon as a fleet is wanted, where Ray or SAPIEN is not installed.
     """
     with ExitStack() as stack:
         begun = False
@@ -49,7 +53,10 @@ def fleets(workers: int, limits: Limits, address: str | None = None) -> Iterator
         def make(make_worker: WorkerFactory, underway: Underway) -> Fleet:
             nonlocal begun
             if workers == 0:
+                require_installed("sapien")
                 return SerialFleet(make_worker)
+            # On a cluster, it is the workers that need SAPIEN.
+            require_installed("ray", *(["sapien"] if address is None else []))
             if not begun:
                 stack.enter_context(ray_session(workers, address))
                 begun = True
@@ -60,6 +67,18 @@ def fleets(workers: int, limits: Limits, address: str | None = None) -> Iterator
             return fleet
 
         yield make
+
+
+def require_installed(*packages: str) -> None:
+    """See that packages which only collection needs are there, as they need not be where a learner runs.
+
+    Raises:
+        UsageError: one is not.
+    """
+    missing = [name for name in packages if find_spec(name) is None]
+    if missing:
+        names = " and ".join(missing)
+        raise UsageError(f"collecting needs {names}, not installed here; install adaafford with all it depends on")
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 
@@ -23,7 +24,7 @@ from cluster.session import fleets, ray_session
 from collector.guard import Limits
 from collector.receipt import Receipt
 from shared.configuration import CollectionConfig
-from shared.errors import StoreError, WorkerError
+from shared.errors import StoreError, UsageError, WorkerError
 from shared.plan import Job, ObjectRef, Plan, Setting, missing_jobs
 from shared.underway import Underway
 from tests.fake_worker import FakeWorker
@@ -345,3 +346,16 @@ def test_a_session_that_does_not_come_up_is_said_in_a_line(monkeypatch: pytest.M
     monkeypatch.setattr("ray.init", late)
     with pytest.raises(WorkerError, match=r"timed out during startup\.\); run the same command again"), ray_session(1):
         pass
+
+
+@pytest.mark.parametrize(("workers", "missing"), [(0, "sapien"), (2, "ray"), (2, "sapien")])
+def test_collecting_says_what_is_not_installed(
+    workers: int, missing: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    found = find_spec
+    monkeypatch.setattr("cluster.session.find_spec", lambda name: None if name == missing else found(name))
+    with (
+        fleets(workers, LIMITS) as make,
+        pytest.raises(UsageError, match=f"needs {missing}, not installed here; install adaafford"),
+    ):
+        make(partial(FakeWorker, tmp_path / "now"), Underway(tmp_path / "underway"))
