@@ -22,9 +22,10 @@ CRITICS = {
     "where2act": "Where2Act",
     "random": "AAP, random tries",
     "aip": "AAP, tries by AIP",
+    "information": "AAP, tries by expected information",
     "oracle": "oracle, told the hidden facts",
 }
-_STYLES = {"random": ("tab:blue", "o"), "aip": ("tab:orange", "s")}
+_STYLES = {"random": ("tab:blue", "o"), "aip": ("tab:orange", "s"), "information": ("tab:green", "^")}
 _LINES = ("-", "--", ":", "-.")
 
 

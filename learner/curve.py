@@ -19,6 +19,7 @@ from learner.critics import OracleScores
 from learner.data import Dataset
 from learner.features import FrozenFeatures
 from learner.frozen import FrozenAap, FrozenPrior
+from learner.information import tries_by_information
 from learner.losses import action_scoring_losses
 from learner.metrics import correlation
 from learner.oracle import OracleCritic
@@ -28,9 +29,9 @@ from shared.networks.prior import Prior
 
 _CHUNK = 16
 
-CriticKind = Literal["where2act", "random", "aip", "oracle"]
-"""Where2Act, which knows no tries; AAP after tries taken at random, or by AIP, from the candidates; the oracle, which
-is told the hidden facts."""
+CriticKind = Literal["where2act", "random", "aip", "information", "oracle"]
+"""Where2Act, which knows no tries; AAP after tries taken from the candidates at random, by AIP, or by what AAP expects
+to learn from them; the oracle, which is told the hidden facts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +121,7 @@ def answer(
     chosen: dict[CriticKind, Tensor] = {"random": candidates.rows[:, :most]}
     if aip is not None:
         chosen["aip"] = tries_by_aip(known, candidates.rows, frozen, aip, most)
+    chosen["information"] = tries_by_information(known, candidates.rows, frozen, most)
     for critic, made in chosen.items():
         latents = frozen.latents(made)
         for number in tries:

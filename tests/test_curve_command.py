@@ -52,14 +52,14 @@ def test_trainings_are_judged_between_where2act_and_the_oracle(
     # One object of four was seen by nobody; each of its two rollouts is drawn twice and asks about half of 12 rows.
     assert (told["rollouts"], told["left_out"]) == (2, 6)
     assert {row["questions"] for row in told["rows"]} == {2 * 2 * 6}
-    tries = [(critic, number) for critic in ("random", "aip") for number in (0, 1, 2, 4)]
+    tries = [(critic, number) for critic in ("random", "aip", "information") for number in (0, 1, 2, 4)]
     by_training = {
         name: [(row["critic"], row["tries"]) for row in told["rows"] if row["name"] == name and not row["run"]]
         for name in ("privileged", "paper")
     }
     assert by_training["privileged"] == [("where2act", 0), *tries, ("oracle", 0)]
     # An AAP alone has no AIP to choose for it, and is held against the oracle of the other training.
-    assert by_training["paper"] == [("where2act", 0), *tries[:4], ("oracle", 0)]
+    assert by_training["paper"] == [("where2act", 0), *tries[:4], *tries[8:], ("oracle", 0)]
     assert list(told["gains"]) == ["privileged"]
     with (tmp_path / CSV_FILE).open() as file:
         assert len(list(csv.DictReader(file))) == len(told["rows"])

@@ -23,6 +23,7 @@ from learner.data import Dataset, Split, load_dataset
 from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
 from learner.features import FrozenFeatures, ProposalPool
 from learner.frozen import FrozenAap
+from learner.information import tries_by_information
 from learner.names import METRICS_FILE
 from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
@@ -178,7 +179,7 @@ def test_the_curve_falls_where_tries_tell_and_greedy_beats_chance(coin_dataset: 
     rows = {(row.critic, row.tries): row for row in rows_of("coins", "", [answers])}
     assert list(rows) == [
         ("where2act", 0),
-        *((critic, tries) for critic in ("random", "aip") for tries in (0, 1, 4)),
+        *((critic, tries) for critic in ("random", "aip", "information") for tries in (0, 1, 4)),
         ("oracle", 0),
     ]
     assert rows["random", 1].bce < rows["random", 0].bce
@@ -217,6 +218,37 @@ def test_aip_chooses_each_candidate_once_and_the_best_by_its_critic(coin_dataset
     assert torch.equal(made.sort(dim=1).values, candidates.rows.sort(dim=1).values)
     again = tries_by_aip(known, candidates.rows.flip(1), frozen, policy.aip, 2)
     assert torch.equal(again, made[:, :2])
+
+
+def test_tries_by_information_leave_aap_as_sure_as_it_expects_to_be(coin_dataset: Dataset) -> None:
+    policy, known = fresh(coin_dataset)
+    descend(AapStage(policy.aap, known, EVERYTHING, AapConfig(context=4, batch_rollouts=8)), 40)
+    frozen, aap, rows = FrozenAap.of(policy.aap, known), policy.aap, coin_dataset.rows
+    candidates = Candidates.of(coin_dataset, EVERYTHING.validation, draws=1, seed=0).rows
+    made = tries_by_information(known, candidates, frozen, 3)
+    assert all(len(set(tries)) == 3 for tries in made.tolist())
+    mine = candidates[0]
+    asked = (frozen.features[mine], rows.xyz[mine], rows.frame[mine])
+
+    def expected(row: int) -> float:
+        """How unsure AAP expects to be after one more try than the first."""
+        before, total = made[0, :1], 0.0
+        place = int((mine == row).nonzero())
+        odds = torch.sigmoid(aap.action_logits(*asked, frozen.latents(before)[-1]))[place]
+        for success in (0.0, 1.0):
+            motion = rows.motion[rows.success == success].median()
+            told = (frozen.features[row], rows.xyz[row], rows.frame[row], motion, torch.tensor(success))
+            code, weight = aap.interaction_codes(*(x[None] for x in told))
+            z = aap.latent(torch.cat([frozen.codes[before], code]), torch.cat([frozen.weights[before], weight]))
+            scores = torch.sigmoid(aap.action_logits(*asked, z)).double()
+            entropy = (torch.special.entr(scores) + torch.special.entr(1 - scores)).mean()
+            total += float((odds if success else 1 - odds) * entropy)
+        return total
+
+    with torch.no_grad():
+        # All coins of a rollout tell the same, so that the best may be a tie.
+        least = min(expected(row) for row in mine.tolist() if row != made[0, 0])
+        assert expected(int(made[0, 1])) == pytest.approx(least, rel=1e-3)
 
 
 def test_gains_are_differences_of_the_loss_on_the_same_rows(coin_dataset: Dataset) -> None:
