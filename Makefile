@@ -27,7 +27,7 @@ test-slow: $(STAMP)  ## The slow tests.
 	@# Pytest ends with 5 where it selects no test, which is no failure of a suite that may be empty.
 	$(BIN)/python -m pytest -q -m slow || test $$? -eq 5
 
-chaos: $(STAMP)  ## Kill campaigns at random moments and disturb every write step, about a quarter of an hour; SEED=N for others.
+chaos: $(STAMP)  ## Kill campaigns at random moments and disturb every write step, about half an hour; SEED=N for others.
 	$(if $(SEED),ADAAFFORD_CHAOS_SEED=$(SEED)) $(BIN)/python -m pytest -q -m chaos
 
 check: $(STAMP)  ## Lint, formatting, types, import directions.
