@@ -4,38 +4,48 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from cluster.configuration import CampaignConfig
 from cluster.evaluation_tables import MARKDOWN_FILE
 from cluster.run_folder import RunFolder
+from learner.alternation import trained_in
+from learner.stages import objects_seen, read_policy_folder
+from shared.configuration import CameraConfig
 from shared.errors import UsageError
 from shared.files import read_bounded
+from shared.plan import ObjectRef
 from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.store import Store
 from shared.store.provenance import software_versions
 
 CARD_FILE = "README.md"
 MAX_TABLE_BYTES = 1 << 20
+PROCEDURAL = "procedural objects only, made by `adaafford objects generate`"
 
 
 @dataclass(frozen=True, slots=True)
-class Exported:
-    """A policy to take elsewhere.
+class Source:
+    """Where a policy comes from, for its card.
 
     Attributes:
-        policy: its prior, AAP and AIP.
-        version: in the run's store.
-        files: weights.safetensors in half precision, policy.json and README.md.
+        policy: the policy.
+        name: what it is called there.
+        store: what it was trained on.
+        objects: how many of the store's objects it saw, and for what.
+        seen: those that it learned from, or was judged by.
+        origin: what kind of objects.
+        results: Markdown; a table, and what it is a table of.
     """
 
     policy: Policy
-    version: int
-    files: dict[str, bytes]
+    name: str
+    store: Store
+    objects: str
+    seen: tuple[ObjectRef, ...]
+    origin: str
+    results: str
 
 
-def export(run: RunFolder, config: CampaignConfig, version: int | None, licence: str) -> Exported:
-    """A run's policy in half precision, with its card.
-
-    The networks of the baselines stay behind: nobody but an evaluation asks for them.
+def source_of_run(run: RunFolder, version: int | None) -> Source:
+    """A campaign's policy.
 
     Raises:
         UsageError: the run has published no policy.
@@ -46,10 +56,69 @@ def export(run: RunFolder, config: CampaignConfig, version: int | None, licence:
     if not known:
         raise UsageError(f"{run.path}: has published no policy yet; finish it with `adaafford resume {run.path}`")
     chosen = known[-1] if version is None else version
-    policy = Policy.from_files(store.read_policy(chosen)).without_baselines()
+    used = run.objects_used()
+    table = run.training("evaluate") / MARKDOWN_FILE
+    return Source(
+        policy=Policy.from_files(store.read_policy(chosen)),
+        name=f"policy {chosen}",
+        store=store,
+        objects=f"{len(used.train)} to learn from, {len(used.validation)} to validate, {len(used.test)} to test",
+        seen=used.train,
+        origin=PROCEDURAL if Path(used.folder) == run.generated_objects.resolve() else "objects of a user's folder",
+        results=_without_title(table) if table.is_file() else "This policy was not evaluated.",
+    )
+
+
+def source_of_training(training: Path, store: Store, results: Path | None, origin: str) -> Source:
+    """The policy of a training from a store (`adaafford train`).
+
+    Args:
+        training: its --out.
+        store: what it was trained on.
+        results: a table of `adaafford curve` or `evaluate`; None: there is none.
+        origin: what the store's objects are.
+
+    Raises:
+        UsageError: the training is not finished, or was of another task.
+        StoreError: what it left is damaged.
+    """
+    folder = trained_in(training).policy
+    policy, seen = read_policy_folder(folder), objects_seen(folder)
+    if policy.task != store.setting.task:
+        raise UsageError(f"{training}: a policy for '{policy.task}', but the store is of '{store.setting.task}'")
+    refs = tuple(ref for ref in store.setting.objects if ref.content_hash in seen)
+    return Source(
+        policy=policy,
+        name=folder.name,
+        store=store,
+        objects=f"{len(refs)} to learn from and to validate by",
+        seen=refs,
+        origin=origin,
+        results="This policy was not evaluated." if results is None else _without_title(results),
+    )
+
+
+def export(source: Source, licence: str) -> dict[str, bytes]:
+    """weights.safetensors in half precision, policy.json, and README.md, the card, by name.
+
+    The networks of the baselines stay behind: nobody but an evaluation asks for them.
+    """
+    policy = source.policy.without_baselines()
     files = policy.to_files(half=True)
-    card = "\n\n".join((_head(policy, files, licence), _data(run, store), _results(run), _limits(config), _use(policy)))
-    return Exported(policy, chosen, {**files, CARD_FILE: f"{card}\n".encode()})
+    camera = source.store.setting.collection.camera
+    card = (
+        _head(policy, files, licence),
+        _data(source),
+        f"## Results\n\n{source.results}",
+        _limits(camera),
+        _use(policy),
+    )
+    return {**files, CARD_FILE: "\n\n".join((*card, "")).encode()}
+
+
+def _without_title(table: Path) -> str:
+    """Markdown without its first line, the title."""
+    return "\n".join(read_bounded(table, MAX_TABLE_BYTES).decode(errors="replace").splitlines()[1:]).strip()
 
 
 def _head(policy: Policy, files: dict[str, bytes], licence: str) -> str:
@@ -68,33 +137,20 @@ Adaptive Affordance Prediction and Adaptive Interaction Proposal (Wang et al., E
 | licence | {licence} |"""
 
 
-def _data(run: RunFolder, store: Store) -> str:
-    used, setting = run.objects_used(), store.setting
-    generated = Path(used.folder) == run.generated_objects.resolve()
-    origin = (
-        "procedural objects only, made by `adaafford objects generate`" if generated else "objects of a user's folder"
-    )
-    categories = Counter(ref.category for ref in used.train)
-    rows = store.interactions(["success"]).to_pydict()["success"] if store.committed() else []
+def _data(source: Source) -> str:
+    setting = source.store.setting
+    categories = Counter(ref.category for ref in source.seen)
+    rows = source.store.interactions(["success"]).to_pydict()["success"] if source.store.committed() else []
     rate = f"{100 * sum(rows) / len(rows):.1f}% successful" if rows else "none"
     return f"""## Data
 
 {len(rows):,} interactions ({rate}) in simulation, seed {setting.seed}, fidelity `{setting.collection.fidelity.name}`,
-clouds of {setting.collection.camera.points} points; {origin}: {len(used.train)} to learn from
-({", ".join(f"{count} {name}" for name, count in sorted(categories.items()))}), {len(used.validation)} to validate,
-{len(used.test)} to test. Digest of the interactions: `{store.digest()[:16]}`."""
+clouds of {setting.collection.camera.points} points; {source.origin}: {source.objects}
+({", ".join(f"{count} {name}" for name, count in sorted(categories.items()))}). Digest of the interactions:
+`{source.store.digest()[:16]}`."""
 
 
-def _results(run: RunFolder) -> str:
-    table = run.training("evaluate") / MARKDOWN_FILE
-    if not table.is_file():
-        return "## Results\n\nThis policy was not evaluated."
-    lines = read_bounded(table, MAX_TABLE_BYTES).decode().splitlines()
-    return "\n".join(["## Results", *lines[1:]])
-
-
-def _limits(config: CampaignConfig) -> str:
-    camera = config.collection.camera
+def _limits(camera: CameraConfig) -> str:
     return f"""## Limits
 
 - Trained in simulation alone: rigid parts, one hinge or slide at a time, a flying Panda hand, noise-free depth.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from adaafford.pretrained import load_policy
 from cluster.cli import run
 from cluster.curves import CSV_FILE, FIGURE_FILE, JSON_FILE, MARKDOWN_FILE
 from learner.alternation import alternate, trained_in
@@ -101,3 +102,26 @@ def test_a_store_of_seen_objects_alone_is_refused(
     given = ["curve", "--store", str(tmp_path / "store"), "--runs", f"a={folder / 'paper'}"]
     assert run(given) == 2
     assert "have seen all its objects" in capsys.readouterr().err
+
+
+def test_a_trainings_policy_is_exported_with_its_curve(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments(folder, "--out", str(tmp_path))) == 0
+    exporting = [
+        "export-policy",
+        str(folder / "seed-1"),
+        "--store",
+        str(folder / "store"),
+        "--out",
+        str(tmp_path / "p"),
+    ]
+    assert run([*exporting, "--results", str(tmp_path / MARKDOWN_FILE), "--origin", "coins"]) == 0
+    card = (tmp_path / "p" / "README.md").read_text()
+    for told in ("coins: 3 to learn from and to validate by", "gap closed", "`adaafford adapt --policy FOLDER"):
+        assert told in card
+    assert load_policy(tmp_path / "p").trained == {"prior", "aap", "aip"}
+    for wrong, why in (["--results", str(tmp_path / "none.md")], "none.md"), (["--store", str(tmp_path)], "is no store"):
+        assert run([*exporting, *wrong]) == 2
+        assert why in capsys.readouterr().err
+    assert run(["export-policy", str(folder / "seed-1"), "--out", str(tmp_path / "p")]) == 2
