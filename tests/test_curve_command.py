@@ -104,10 +104,11 @@ def test_a_store_of_seen_objects_alone_is_refused(
     assert "have seen all its objects" in capsys.readouterr().err
 
 
-def test_a_trainings_policy_is_exported_with_its_curve(
+def test_a_trainings_policy_is_exported_with_a_table(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(arguments(folder, "--out", str(tmp_path))) == 0
+    table = tmp_path / MARKDOWN_FILE
+    table.write_text("# push\n\nHow much of the gap closed.\n")
     exporting = [
         "export-policy",
         str(folder / "seed-1"),
@@ -116,12 +117,19 @@ def test_a_trainings_policy_is_exported_with_its_curve(
         "--out",
         str(tmp_path / "p"),
     ]
-    assert run([*exporting, "--results", str(tmp_path / MARKDOWN_FILE), "--origin", "coins"]) == 0
+    assert run([*exporting, "--results", str(table), "--origin", "coins"]) == 0
     card = (tmp_path / "p" / "README.md").read_text()
-    for told in ("coins: 3 to learn from and to validate by", "gap closed", "`adaafford adapt --policy FOLDER"):
+    for told in (
+        "coins: 3 to learn from and to validate by",
+        "## Results\n\nHow much of the gap closed.\n\n## Limits",
+        "`adaafford adapt --policy FOLDER",
+    ):
         assert told in card
     assert load_policy(tmp_path / "p").trained == {"prior", "aap", "aip"}
-    for wrong, why in (["--results", str(tmp_path / "none.md")], "none.md"), (["--store", str(tmp_path)], "is no store"):
+    for wrong, why in (
+        (["--results", str(tmp_path / "none.md")], "none.md"),
+        (["--store", str(tmp_path)], "is no store"),
+    ):
         assert run([*exporting, *wrong]) == 2
         assert why in capsys.readouterr().err
     assert run(["export-policy", str(folder / "seed-1"), "--out", str(tmp_path / "p")]) == 2
