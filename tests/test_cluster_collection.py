@@ -161,7 +161,7 @@ def test_every_policy_is_published_before_it_is_used(tmp_path: Path, alternation
         assert [names.index(name) for name in order] == sorted(names.index(name) for name in order)
 
 
-QUICK = {"steps": 3, "affordance": {"steps": 3}}
+QUICK = {"steps": 3, "affordance": {"steps": 3, "questions": 64, "points": 16}}
 SMALL = {
     "rollouts": {"random": 10, "aip": 2, "evaluation": 2},
     "procedural": {"per_category": 6},
