@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 
 from adaafford.heatmaps import colours, write_heatmap
 from adaafford.histories import MAX_TRIES, History, TriedOutcome, read_history, write_history
-from adaafford.pretrained import load_policy, only_pretrained, pretrained_names
+from adaafford.pretrained import PRETRAINED_FOLDER, load_policy, only_pretrained, pretrained_names
 from adaafford.scans import ScanFrame, action_at, checked_scan, observation_of, read_scan
 from adaafford.sessions import Session, SessionFiles, Step
 from cluster.cli import run as adaafford
@@ -354,6 +354,18 @@ def test_a_policy_is_found_by_folder_file_run_or_name(
     assert load_policy("pull-closed-door").to_files() == wanted
     with pytest.raises(UsageError, match=r"no policy 'push': give a name \(pull-closed-door\)"):
         load_policy("push")
+
+
+@pytest.mark.parametrize("name", ["pull-closed-door", "push-faucet"])
+def test_the_package_brings_a_policy_with_its_card(name: str) -> None:
+    policy = load_policy(name)
+    assert (policy.task, policy.trained) == (name, {"prior", "aap", "aip"})
+    card = (PRETRAINED_FOLDER / name / "README.md").read_text()
+    assert "procedural objects only" in card
+    assert "gap closed" in card
+    scan = checked_scan(front())
+    heat = Adapter(policy).affordance(observation_of(scan, ScanFrame.around(scan)), [])
+    assert np.ptp(heat) > 0.01, "no place is better than another"
 
 
 def test_scores_in_half_precision_agree(policy_folder: Path) -> None:
