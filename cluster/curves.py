@@ -138,7 +138,7 @@ def _by_run(rows: Sequence[CurveRow]) -> list[str]:
 
 def draw_curves(curves: Curves, path: Path) -> None:
     """F-score and the share of the gap that is closed against the number of tries, with intervals over objects."""
-    figure = Figure(figsize=(10, 4.2), dpi=120, layout="constrained")
+    figure = Figure(figsize=(10, 5), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     pooled = [row for row in curves.rows if not row.run]
@@ -161,11 +161,11 @@ def draw_curves(curves: Curves, path: Path) -> None:
     right.axhline(0.0, color="0.5", linewidth=1)
     right.axhline(1.0, color="black", linewidth=1)
     left.set_ylabel("F-score at threshold 0.5")
-    right.set_ylabel("share of the gap in cross entropy that is closed")
+    right.set_ylabel("closed share of the gap in cross entropy")
     for axes in (left, right):
         axes.set_xlabel("tries")
         axes.grid(alpha=0.3)
-    left.legend(fontsize=7)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle(f"{curves.task}: {pooled[0].objects} objects not seen in training", fontsize=10)
     figure.savefig(path, format="png")
 
