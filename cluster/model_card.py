@@ -113,7 +113,7 @@ def export(source: Source, licence: str) -> dict[str, bytes]:
         _limits(camera),
         _use(policy),
     )
-    return {**files, CARD_FILE: "\n\n".join((*card, "")).encode()}
+    return {**files, CARD_FILE: ("\n\n".join(card) + "\n").encode()}
 
 
 def _without_title(table: Path) -> str:

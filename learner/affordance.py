@@ -78,8 +78,8 @@ class Critic(Protocol):
     module: nn.Module
     """All that is trained, and nothing else."""
 
-    def answer(self, questions: Questions) -> tuple[tuple[Tensor, ...], Tensor]:
-        """What D is told of the questions, [Q, ...] each, and what the critic makes of them, [Q]."""
+    def answer(self, questions: Questions) -> Answered:
+        """What D is told of the questions, and what the critic makes of them."""
         ...
 
     def predict(self, *told: Tensor) -> Tensor:
@@ -174,8 +174,8 @@ class AffordanceStage:
             here = slice(start, start + _CHUNK)
             frames = self.pool.draw(cloud[here], slot[here], self.config.proposals, rng)
             chunks.append(self.critic.answer(Questions(cloud[here], slot[here], place[here], frames, latents[here])))
-        told = zip(*(told for told, _ in chunks), strict=True)
-        return Answered(tuple(torch.cat(each) for each in told), torch.cat([target for _, target in chunks]))
+        told = zip(*(chunk.told for chunk in chunks), strict=True)
+        return Answered(tuple(torch.cat(each) for each in told), torch.cat([chunk.target for chunk in chunks]))
 
     def _latents(self, ordered: OrderedRows, which: Tensor, rng: np.random.Generator) -> Tensor:
         """The z of the first tries of some of the rollouts, of which there may be none, [Q, latent_width]."""
@@ -195,11 +195,11 @@ class PriorCritic:
         self.prior = prior
         self.pool = pool
 
-    def answer(self, questions: Questions) -> tuple[tuple[Tensor, ...], Tensor]:
+    def answer(self, questions: Questions) -> Answered:
         """Features and places, and the mean of the scores."""
         features = self.pool.features[questions.cloud, questions.slot]
         logits = self.prior.action_logits(features[:, None], questions.point[:, None], questions.frames)
-        return (features, questions.point), mean_score(torch.sigmoid(logits))
+        return Answered((features, questions.point), mean_score(torch.sigmoid(logits)))
 
     def predict(self, *told: Tensor) -> Tensor:
         """a_p."""
@@ -216,10 +216,10 @@ class AapCritic:
         self.frozen = frozen
         self.top = top
 
-    def answer(self, questions: Questions) -> tuple[tuple[Tensor, ...], Tensor]:
+    def answer(self, questions: Questions) -> Answered:
         """Features, places and z, and the mean of the best scores."""
         features, scores = aap_scores(self.frozen, questions)
-        return (features, questions.point, questions.latents), top_score(scores, self.top)
+        return Answered((features, questions.point, questions.latents), top_score(scores, self.top))
 
     def predict(self, *told: Tensor) -> Tensor:
         """a_p|z."""
@@ -238,7 +238,7 @@ class AipCritic:
         self.frozen = frozen
         self.top = top
 
-    def answer(self, questions: Questions) -> tuple[tuple[Tensor, ...], Tensor]:
+    def answer(self, questions: Questions) -> Answered:
         """Features, places, z and what AAP makes of the points, and the mean of the best scores."""
         aap_features, scores = aap_scores(self.frozen, questions)
         features, latents = self.features[questions.cloud, questions.slot], questions.latents
@@ -246,7 +246,7 @@ class AipCritic:
         gains = self.aip.action_scores(
             features[:, None], questions.point[:, None], questions.frames, latents[:, None], scores
         )
-        return (features, questions.point, latents, believed), top_score(gains, self.top)
+        return Answered((features, questions.point, latents, believed), top_score(gains, self.top))
 
     def predict(self, *told: Tensor) -> Tensor:
         """a^AIP_p|z."""

@@ -66,9 +66,11 @@ def nearest_points(points: Float32, count: int) -> Indices:
 
     The same as `shared.networks.pointnet2.surroundings` finds for single points of many clouds.
     """
+    if not count:
+        return np.zeros((len(points), 0), dtype=np.int16)
     ranks = np.arange(1, min(count, len(points)) + 1)
-    found = np.asarray(cKDTree(points).query(points, k=ranks)[1]) if count else np.zeros((len(points), 0))
-    return np.pad(found, ((0, 0), (0, count - len(ranks))), mode="edge" if count else "empty").astype(np.int16)
+    found = np.asarray(cKDTree(points).query(points, k=ranks)[1])
+    return np.pad(found, ((0, 0), (0, count - len(ranks))), mode="edge").astype(np.int16)
 
 
 def _within(points: Float32, centres: Float32, count: int, radius: float) -> Indices:

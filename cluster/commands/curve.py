@@ -102,12 +102,14 @@ def _judge(command: CurveCommand, runs: dict[str, list[Path]]) -> "Curves":
     candidates = Candidates.of(dataset, rollouts, command.draws, command.seed)
     if candidates.count < max(command.tries):
         raise UsageError(f"--tries {max(command.tries)}: the store's rollouts leave {candidates.count} to try")
-    known, rows, gains = FrozenFeatures(dataset), [], {}
+    rows, gains = [], {}
     for name, found in trained.items():
         answers = []
         for place, (run, policy) in enumerate(zip(found, policies[name], strict=True)):
             others = [all_[place].oracle for all_ in trained.values() if place < len(all_)]
             oracle = next((path for path in [run.oracle, *others] if path is not None), None)
+            # Kept for one run alone, so that memory does not grow with their number.
+            known = FrozenFeatures(dataset)
             answered, gained = _answers(known, candidates, policy, oracle, command.tries, gains=name not in gains)
             answers.append((str(place + 1), answered))
             if gained:

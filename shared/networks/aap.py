@@ -6,7 +6,7 @@ from torch.nn import functional
 
 from shared.networks.actions import outcome_inputs, outcome_width
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features
+from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features, present
 from shared.networks.pointnet2 import PointNet2
 
 MIN_ATTENTION = 1e-4
@@ -117,8 +117,7 @@ class Aap(nn.Module):
 
     def affordance_network(self) -> nn.Module:
         """All that D has of its own."""
-        own = {"head": self.affordance_head}
-        return nn.ModuleDict(own if self.place_encoder is None else own | {"place": self.place_encoder})
+        return present(head=self.affordance_head, place=self.place_encoder)
 
 
 class OracleEncoder(nn.Module):

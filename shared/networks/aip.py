@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features
+from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features, present
 from shared.networks.pointnet2 import PointNet2
 
 SCORE_SCALE = 0.02
@@ -67,5 +67,4 @@ class Aip(nn.Module):
 
     def affordance_network(self) -> nn.Module:
         """All that D has of its own."""
-        own = {"head": self.affordance_head, "believed": self.actionability_encoder}
-        return nn.ModuleDict(own if self.place_encoder is None else own | {"place": self.place_encoder})
+        return present(head=self.affordance_head, believed=self.actionability_encoder, place=self.place_encoder)

@@ -127,6 +127,11 @@ class PlaceEncoder(nn.Module):
         return torch.stack(told).sum(dim=0)
 
 
+def present(**modules: nn.Module | None) -> nn.ModuleDict:
+    """Those of some modules that there are, by name."""
+    return nn.ModuleDict({name: module for name, module in modules.items() if module is not None})
+
+
 def surrounding_offsets(features: Tensor, config: NetworkConfig) -> Tensor:
     """Offsets of the points around p, [..., surroundings, 3], of all that is known of points, [..., point_width]."""
     around = features[..., config.feature_width :]

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from shared.networks.actions import FRAME_WIDTH, orthonormal_frames
 from shared.networks.configuration import NetworkConfig
-from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, point_features
+from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, point_features, present
 from shared.networks.pointnet2 import PointNet2
 
 
@@ -60,8 +60,7 @@ class Prior(nn.Module):
 
     def affordance_network(self) -> nn.Module:
         """All that D has of its own."""
-        own = {"head": self.affordance_head}
-        return nn.ModuleDict(own if self.place_encoder is None else own | {"place": self.place_encoder})
+        return present(head=self.affordance_head, place=self.place_encoder)
 
 
 def _single(x: Tensor) -> Tensor:
