@@ -5,6 +5,7 @@ of being looked for among all that are expected, and seats are filed by what the
 """
 
 import logging
+import socket
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -23,7 +24,7 @@ from cluster.orders import Order, Orders
 from cluster.seats import Seat, Seats, Task
 from collector.actor import WorkerActor
 from collector.guard import Limits
-from shared.errors import AdaAffordError
+from shared.errors import AdaAffordError, WorkerError
 from shared.files import end_if_here
 from shared.plan import Job, Plan
 from shared.underway import Underway
@@ -40,6 +41,8 @@ KEPT = 3
 """Plans and policies that the object store holds; older ones were replaced, and only jobs that failed want them."""
 POLL_S = 1.0
 """How often the driver looks for hung actors, however many receipts come."""
+NODE_S = 2.0
+"""How often it looks, while actors are awaited, whether its own node lives: without it none may ever come."""
 LOOK_S = 0.1
 """How long it looks each time, at one after the other: a breadcrumb in a bucket takes a request."""
 
@@ -131,7 +134,7 @@ class RayFleet:
         self._underway = underway
         self._limits = limits
         self._poll_s = min(POLL_S, limits.rollout_s / 4)
-        self._looked = time.monotonic()
+        self._looked = self._looked_at_node = time.monotonic()
         self._seats = Seats(workers)
         self._in_flight = 0
         self._answered: SimpleQueue[Seat] = SimpleQueue()
@@ -258,6 +261,9 @@ class RayFleet:
         if now - self._looked < self._poll_s:
             return
         self._looked = now
+        if self._seats.called and now - self._looked_at_node > NODE_S:
+            self._looked_at_node = now
+            _require_own_node()
         for seat in self._seats.in_turn():
             if time.monotonic() - now > LOOK_S:
                 return
@@ -331,3 +337,24 @@ class RayFleet:
         self._in_flight -= len(seat.orders)
         seat.vacate()
         self._seats.file(seat)
+
+
+def _require_own_node() -> None:
+    """See that the node lives through which this process reaches Ray: its only one, if the session is our own.
+
+    Ray itself takes a quarter of a minute to notice, and then ends this process without a word.
+
+    Raises:
+        WorkerError: it does not.
+    """
+    own = ray.get_runtime_context().get_node_id()
+    nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
+    node = next((node for node in nodes if node["NodeID"] == own and node["Alive"]), None)
+    try:
+        if node is None:
+            raise ConnectionError
+        socket.create_connection((node["NodeManagerAddress"], node["NodeManagerPort"]), timeout=NODE_S).close()
+    except ConnectionError:
+        raise WorkerError("Ray's process on this machine (its raylet) has died; run the same command again") from None
+    except OSError:  # It is too busy to answer, say.
+        return

@@ -4,6 +4,7 @@ import logging
 import os
 import re
 import signal
+import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future
@@ -13,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 
+import psutil
 import pytest
 
 from cluster.blame import MAX_FAULTS, MAX_LOSSES
@@ -29,6 +31,7 @@ from shared.plan import Job, ObjectRef, Plan, Setting, missing_jobs
 from shared.underway import Underway
 from tests.fake_worker import FakeWorker
 
+ROOT = Path(__file__).parents[1]
 LIMITS = Limits(rollout_s=2.0, memory_mb=1000.0)
 
 
@@ -337,6 +340,25 @@ def calls_a_shard(fleet: RayFleet, actors: int, shards: int = 1500) -> float:
     finally:
         sys.setprofile(None)
     return calls / shards
+
+
+@pytest.mark.slow
+def test_a_session_whose_raylet_has_died_is_given_up(tmp_path: Path) -> None:
+    """Ray itself may wait for ever for the first actor. In a process of its own, which has no other session."""
+    program = f"from tests.test_cluster_fleet import run_without_raylet; run_without_raylet({str(tmp_path)!r})"
+    # A file, since what is left of Ray holds a pipe open for a while.
+    with (tmp_path / "log").open("w") as log:
+        subprocess.run([sys.executable, "-c", program], stdout=log, stderr=log, timeout=100, cwd=ROOT)
+    assert "WorkerError: Ray's process on this machine (its raylet) has died" in (tmp_path / "log").read_text()
+
+
+def run_without_raylet(folder: str) -> None:
+    """Kill a session's raylet before it is asked for actors."""
+    with ray_session(1):
+        for child in psutil.Process().children(recursive=True):
+            if child.name() == "raylet":
+                child.kill()
+        run(RayFleet(partial(FakeWorker, Path(folder)), Underway(Path(folder)), 1, LIMITS), 3)
 
 
 def test_a_session_that_does_not_come_up_is_said_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
