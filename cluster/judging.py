@@ -54,6 +54,7 @@ def judge(store: Store, version: int, oracle: Path) -> Table:
         rollouts=sum(shard.stop - shard.start for shard in store.committed()),
         policy_version=version,
         store_digest=store.digest(),
+        contents={ref.id: ref.content_hash for ref in store.setting.objects},
         rows=tuple(_plain(row) | {"gap_closed": _finite(_gap_closed(row, rows))} for row in rows),
     )
 

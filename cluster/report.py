@@ -103,7 +103,8 @@ def _write_page(run: RunFolder, config: CampaignConfig, experiments: bool, say: 
 
 def _results_table(summary: dict[str, Any]) -> Table:
     table = Table(title=f"{summary['task']}: objects not seen in training")
-    names = ("method", "budget", "f_score", "sample_success", "trials", "best_f", "bce", "auc", "base_rate")
+    figures = ("f_score", "sample_success", "start_success", "trials", "best_f", "bce", "auc", "base_rate")
+    names = ("method", "budget", *figures)
     for name in names:
         table.add_column(name.replace("_", " "), justify="left" if name == "method" else "right")
     for row in summary["rows"]:

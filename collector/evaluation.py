@@ -1,7 +1,9 @@
 """Evaluation rollouts: the paper's test-time procedure, for every method on the same object and hidden dynamics.
 
 Every method starts from the same state. Its tries continue one another; after each budget the action that its adapted
-affordance chooses is executed from where the tries left the object (as in the paper), and undone.
+affordance chooses is executed from where the tries left the object (as in the paper), and undone. Tries that leave an
+object in the middle of its range, where it can be moved either way, make that easy whatever they taught; so another
+action is chosen and executed where all methods began.
 """
 
 from collections.abc import Callable
@@ -14,7 +16,7 @@ from collector.recorder import Recorder, try_from_one_state, try_repeatedly
 from shared import seeds
 from shared.methods import method_named
 from shared.plan import Plan
-from shared.vocabulary import Interaction, Order, Proposer, Role
+from shared.vocabulary import Float, Interaction, Order, Proposer, Role
 
 ProposerFactory = Callable[[str, np.random.Generator, int], Proposer]
 """Makes the proposer of a name, such as "aip", with its own randomness, of a policy version."""
@@ -59,7 +61,7 @@ def evaluate(
             context = RandomProposer(rng(f"context/{name}"), edge_share)
         elif method.tries is not None:
             context = make_proposer(method.tries, rng(f"context/{name}"), version)
-        _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), clock)
+        _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), start, clock)
 
 
 def _adapt(
@@ -68,6 +70,7 @@ def _adapt(
     context: Proposer | None,
     exploiter: Proposer,
     budgets: list[int],
+    start: Float,
     clock: StageClock,
 ) -> None:
     """Fill the set of interactions one try at a time; at each budget, execute what the method would do, and undo it."""
@@ -75,12 +78,16 @@ def _adapt(
     for budget in budgets:
         if context is not None:  # A proposer that has seen enough leaves the greater budgets with what there is.
             try_repeatedly(recorder, context, budget, Role.CONTEXT, history, method, clock)
-        if not recorder.sound or not (observation := environment.observe()).movable.any():
+        if not recorder.sound or not environment.observe().movable.any():
             return
-        state = environment.state()
-        action = exploiter.propose(observation, history)
-        assert action is not None, "an exploiter never stops"
-        recorder.try_action(action, exploiter.name, Order.RESTART, Role.EXPLOIT, method, budget)
-        if not recorder.sound:
-            return
-        environment.restore(state)
+        left = environment.state()
+        # Without tries, the one is the other.
+        for role, state in ((Role.EXPLOIT, left), (Role.EXPLOIT_AT_START, start))[: 1 if context is None else 2]:
+            environment.restore(state)
+            with clock.stage("propose"):
+                action = exploiter.propose(environment.observe(), history)
+            assert action is not None, "an exploiter never stops"
+            recorder.try_action(action, exploiter.name, Order.RESTART, role, method, budget)
+            if not recorder.sound:
+                return
+        environment.restore(left)

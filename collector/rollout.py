@@ -14,7 +14,7 @@ from shared.geometry import camera_pose
 from shared.plan import Plan
 from shared.records import RolloutRecord, RolloutStatus
 from shared.tasks import task_named
-from shared.vocabulary import Order, Role
+from shared.vocabulary import Order, Proposer, Role
 
 TRIES = 8
 """Draws of a camera and a state before a rollout is given up as showing nothing that could be acted upon."""
@@ -79,22 +79,21 @@ def collect(
     make_proposer: ProposerFactory,
     clock: StageClock,
 ) -> None:
-    """Training data: what a policy proposes comes first, each try continuing the last; random tries fill the rest."""
+    """Training data: tries that continue, a policy's if there is one; then random ones from one state after another."""
     rollout = plan.setting.collection.rollout
     rng = seeds.generator(plan.setting.seed, f"actions/{plan.key}", index)
-    random = RandomProposer(rng, plan.setting.terms.edge_share)
+    random: Proposer = RandomProposer(rng, plan.setting.terms.edge_share)
     environment = recorder.environment
     if plan.proposer != RandomProposer.name:
-        first = environment.state()
         rng = seeds.generator(plan.setting.seed, f"policy/{plan.key}", index)
-        most = min(rollout.context, rollout.interactions)
-        try_repeatedly(
-            recorder, make_proposer(plan.proposer, rng, plan.policy_version), most, Role.COLLECT, [], "", clock
-        )
+        first, most = make_proposer(plan.proposer, rng, plan.policy_version), rollout.context
+    else:
+        first, most = random, rollout.interactions if rollout.order is Order.CONTINUE else rollout.continued
+    if most:
+        start = environment.state()
+        try_repeatedly(recorder, first, min(most, rollout.interactions), Role.COLLECT, [], "", clock)
         if recorder.sound:
-            environment.restore(first)
-    elif rollout.order is Order.CONTINUE:
-        try_repeatedly(recorder, random, rollout.interactions, Role.COLLECT, [], "", clock)
+            environment.restore(start)
     while recorder.sound and (left := rollout.interactions - len(recorder.interactions)) > 0:
         one_state = environment.task.closed  # Every draw of a state would give the same one.
         before = len(recorder.interactions)

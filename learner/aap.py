@@ -136,7 +136,7 @@ class AapStage:
         config, train = self.config, self.parts.train
         chosen = draw_numbers(len(train), min(config.batch_rollouts, len(train)), rng)
         rollouts = [train[number] for number in chosen]
-        ordered = order_rows(self.dataset, rollouts, config.rows_per_rollout, rng, config.proposed_first)
+        ordered = order_rows(self.dataset, rollouts, config.rows_per_rollout, rng, config.continued_first)
         context = ordered.longest_context(config.context)
         turns = draw_turns(len(rollouts), config.augmentation, rng)
         mine = share(len(rollouts))
@@ -162,7 +162,8 @@ class AapStage:
         scores: dict[int, list[Tensor]] = {tries: [] for tries in CURVE if tries <= self.config.context}
         labels, losses = [], []
         for start in range(0, len(rollouts), _CHUNK):
-            ordered = order_rows(self.dataset, rollouts[start : start + _CHUNK], self.config.rows_per_rollout, rng)
+            chunk, config = rollouts[start : start + _CHUNK], self.config
+            ordered = order_rows(self.dataset, chunk, config.rows_per_rollout, rng, config.continued_first)
             context = ordered.longest_context(self.config.context)
             seen = self._see(ordered)
             prediction = predict(self.aap, seen, context)

@@ -90,8 +90,9 @@ class AapConfig(TrainingConfig):
     context: int = Field(8, ge=1)
     """The longest context; every shorter one, and none, is trained in the same pass."""
     augmentation: AugmentationConfig = AugmentationConfig()
-    proposed_first: float = Field(0.5, ge=0, le=1)
-    """How often the tries that a policy proposed come first in the context, where a rollout has some."""
+    continued_first: float = Field(0.5, ge=0, le=1)
+    """How often the tries that continued one another come first in the context, where a rollout has some: what a policy
+    proposed, and random ones by `rollout.continued`."""
     top: int = Field(5, ge=1)
     """Best proposals whose mean score is a point's actionability, as published."""
     affordance: AffordanceConfig = AffordanceConfig()

@@ -26,11 +26,11 @@ from shared.networks.pointnet2 import CloudBatch
 from shared.store.columns import INTERACTION_COLUMNS
 from shared.store.store import Store
 from shared.store.tables import column_values
-from shared.vocabulary import Float32, OutcomeKind
+from shared.vocabulary import Float32, Order, OutcomeKind
 
 COLUMNS = (
     *("plan_key", "rollout", "object_id", "part_mass", "joint_friction", "surface_friction", "step"),
-    *("point_index", "rotation", "role", "policy_version", "method", "budget", "target_part"),
+    *("point_index", "rotation", "order", "role", "policy_version", "method", "budget", "target_part"),
     *("joint_positions", "joint_limits", "joint_twist", "outcome", "motion", "success"),
 )
 VALIDATION_SHARE = 5
@@ -49,7 +49,7 @@ class Rows:
         motion: m, [I].
         success: r as 0 or 1, [I].
         step: [I], number within the rollout.
-        proposed: [I], whether a policy chose the action.
+        continued: [I], whether the row began where the one before it left the object.
         facts: [I, FACTS_WIDTH], for the oracle only.
         role, method: [I], names (see `shared.records.InteractionRecord`).
         budget: [I].
@@ -62,7 +62,7 @@ class Rows:
     motion: Tensor
     success: Tensor
     step: Tensor
-    proposed: Tensor
+    continued: Tensor
     facts: Tensor
     role: NDArray[np.str_]
     method: NDArray[np.str_]
@@ -264,7 +264,7 @@ def _rows(
         motion=torch.from_numpy(cells["motion"].astype(np.float32)),
         success=torch.from_numpy(cells["success"].astype(np.float32)),
         step=torch.from_numpy(cells["step"].astype(np.int64)),
-        proposed=torch.from_numpy(cells["policy_version"] > 0),
+        continued=torch.from_numpy(np.array(cells["order"]) == Order.CONTINUE.value),
         facts=torch.from_numpy(facts_of(hidden).astype(np.float32)),
         role=np.array(cells["role"]),
         method=np.array(cells["method"]),

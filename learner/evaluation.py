@@ -1,7 +1,8 @@
 """The table: what each method knows after each budget of tries, and whether acting on it succeeds.
 
 An evaluation store holds, for each rollout, random QUERY rows that critics are asked about; for each method, CONTEXT
-rows, its tries in order; and for each method and budget, EXPLOIT rows, what the adapted affordance then chose.
+rows, its tries in order; and for each method and budget, EXPLOIT rows, what the adapted affordance then chose where the
+tries had left the object, and EXPLOIT_AT_START rows, what it chose where they had begun.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from learner.bootstrap import f_score_interval, ratio_interval
+from learner.bootstrap import ratio_interval
 from learner.critics import OracleScores, RowCritic, row_critic
 from learner.data import Dataset, load_dataset
 from learner.features import FrozenFeatures
@@ -33,6 +34,45 @@ ORACLE_METHOD = "oracle"
 
 
 @dataclass(frozen=True, slots=True)
+class ObjectCounts:
+    """What a row counts on each object, a column each; sums over objects, or over evaluations, are its figures.
+
+    Attributes:
+        object: its id.
+        queries: QUERY rows.
+        true: those that succeeded.
+        claimed: those that the critic called successes.
+        hits: those that both hold of.
+        trials: EXPLOIT rows.
+        successes: those that succeeded.
+        start_trials: EXPLOIT_AT_START rows; where a method tries nothing, these are the EXPLOIT rows.
+        start_successes: those that succeeded.
+    """
+
+    object: tuple[str, ...]
+    queries: tuple[int, ...]
+    true: tuple[int, ...]
+    claimed: tuple[int, ...]
+    hits: tuple[int, ...]
+    trials: tuple[int, ...]
+    successes: tuple[int, ...]
+    start_trials: tuple[int, ...]
+    start_successes: tuple[int, ...]
+
+    def f_score(self) -> tuple[float, float, float]:
+        """F1 = 2 hits / (claimed + true), and its 95% interval over objects; NaN where nothing is claimed or true."""
+        return _ratio(2 * np.array(self.hits), np.add(self.claimed, self.true), self.queries)
+
+    def sample_success(self) -> tuple[float, float, float]:
+        """The share of EXPLOIT rows that succeeded, and its 95% interval over objects; NaN where there are none."""
+        return _ratio(self.successes, self.trials, self.trials)
+
+    def start_success(self) -> tuple[float, float, float]:
+        """The same of EXPLOIT_AT_START rows."""
+        return _ratio(self.start_successes, self.start_trials, self.start_trials)
+
+
+@dataclass(frozen=True, slots=True)
 class EvaluationRow:
     """One method after one budget of tries, on all rollouts together; NaN where there was nothing to measure.
 
@@ -47,12 +87,16 @@ class EvaluationRow:
         base_rate: share of successes among the QUERY rows.
         queries: how many QUERY rows.
         sample_success: share of the EXPLOIT rows that succeeded.
+        start_success: share of the EXPLOIT_AT_START rows that succeeded.
         trials: how many EXPLOIT rows.
         mean_tries: tries made a rollout, which stopping may leave below the budget.
         f_score_low: where its 95% interval over objects begins.
         f_score_high: where it ends.
         sample_success_low: where its 95% interval over objects begins.
         sample_success_high: where it ends.
+        start_success_low: where its 95% interval over objects begins.
+        start_success_high: where it ends.
+        counts: what these are of, by object.
     """
 
     task: str
@@ -65,12 +109,16 @@ class EvaluationRow:
     base_rate: float
     queries: int
     sample_success: float
+    start_success: float
     trials: int
     mean_tries: float
     f_score_low: float
     f_score_high: float
     sample_success_low: float
     sample_success_high: float
+    start_success_low: float
+    start_success_high: float
+    counts: ObjectCounts
 
 
 def evaluate_store(
@@ -159,7 +207,8 @@ class _Judge:
         if not sum(map(len, self.queries)):
             raise StoreError("the store holds no query to judge by; evaluate on a store made by an evaluation plan")
         self._critics: dict[tuple[CriticName, int], RowCritic] = {}
-        numbers = {name: number for number, name in enumerate(sorted(set(dataset.objects)))}
+        self._names = tuple(sorted(set(dataset.objects)))
+        numbers = {name: number for number, name in enumerate(self._names)}
         self._object_of = np.zeros(len(rows.success), dtype=np.int64)
         for index, name in zip(dataset.rollouts, dataset.objects, strict=True):
             self._object_of[index.numpy()] = numbers[name]
@@ -179,27 +228,57 @@ class _Judge:
         labels = self.dataset.rows.success[asked].numpy()
         believed = torch.cat(scores).numpy()
         found = discrimination(believed, labels)
-        f_low, f_high = f_score_interval(believed >= THRESHOLD, labels > THRESHOLD, self._object_of[asked.numpy()])
-        chosen = self._exploits(method, budget)
-        exploits = self.dataset.rows.success.numpy()[chosen].astype(np.float64)
-        success_low, success_high = ratio_interval(exploits, np.ones(len(exploits)), self._object_of[chosen])
+        counts = self._counts(method, budget, asked.numpy(), believed >= THRESHOLD, labels > THRESHOLD)
+        (f_score, f_low, f_high), (success, success_low, success_high) = counts.f_score(), counts.sample_success()
+        start, start_low, start_high = counts.start_success()
         return EvaluationRow(
             task=self.dataset.task,
             method=method,
             budget=budget,
-            f_score=found.f_score,
+            f_score=f_score,
             best_f_score=found.best_f_score,
             bce=found.bce,
             auc=found.auc,
             base_rate=found.base_rate,
             queries=found.rows,
-            sample_success=float(exploits.mean()) if len(exploits) else float("nan"),
-            trials=len(exploits),
+            sample_success=success,
+            start_success=start,
+            trials=sum(counts.trials),
             mean_tries=float(np.mean([len(context) for _, context in pairs])),
             f_score_low=f_low,
             f_score_high=f_high,
             sample_success_low=success_low,
             sample_success_high=success_high,
+            start_success_low=start_low,
+            start_success_high=start_high,
+            counts=counts,
+        )
+
+    def _counts(
+        self,
+        method: str,
+        budget: int,
+        asked: NDArray[np.int64],
+        claimed: NDArray[np.bool_],
+        true: NDArray[np.bool_],
+    ) -> ObjectCounts:
+        success = self.dataset.rows.success.numpy() > THRESHOLD
+        chosen = self._exploits(Role.EXPLOIT, method, budget)
+        at_start = chosen if method == PRIOR_METHOD else self._exploits(Role.EXPLOIT_AT_START, method, budget)
+
+        def of_objects(rows: NDArray[np.int64]) -> tuple[int, ...]:
+            return tuple(np.bincount(self._object_of[rows], minlength=len(self._names)).tolist())
+
+        return ObjectCounts(
+            object=self._names,
+            queries=of_objects(asked),
+            true=of_objects(asked[true]),
+            claimed=of_objects(asked[claimed]),
+            hits=of_objects(asked[claimed & true]),
+            trials=of_objects(chosen),
+            successes=of_objects(chosen[success[chosen]]),
+            start_trials=of_objects(at_start),
+            start_successes=of_objects(at_start[success[at_start]]),
         )
 
     def _context(self, index: Tensor, method: str, budget: int) -> Tensor:
@@ -207,10 +286,18 @@ class _Judge:
         rows, numbers = self.dataset.rows, index.numpy()
         return index[(rows.role[numbers] == Role.CONTEXT.value) & (rows.method[numbers] == method)][:budget]
 
-    def _exploits(self, method: str, budget: int) -> NDArray[np.int64]:
+    def _exploits(self, role: Role, method: str, budget: int) -> NDArray[np.int64]:
         """Rows of the exploits; those of a prior count whatever budget they are listed under."""
         rows = self.dataset.rows
-        chosen = (rows.role == Role.EXPLOIT.value) & (rows.method == method)
+        chosen = (rows.role == role.value) & (rows.method == method)
         if method != PRIOR_METHOD:
             chosen &= rows.budget == budget
         return np.flatnonzero(chosen)
+
+
+def _ratio(above: ArrayLike, below: ArrayLike, rows: ArrayLike) -> tuple[float, float, float]:
+    """sum(above) / sum(below) over the objects with any rows, and its 95% interval."""
+    seen = np.flatnonzero(rows)
+    over, under = np.asarray(above)[seen], np.asarray(below)[seen]
+    whole = float(over.sum() / under.sum()) if under.sum() else float("nan")
+    return whole, *ratio_interval(over, under, seen)

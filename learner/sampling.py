@@ -58,7 +58,7 @@ def order_rows(
     rollouts: Sequence[int],
     size: int,
     rng: np.random.Generator,
-    proposed_first: float = 0.0,
+    continued_first: float = 0.0,
 ) -> OrderedRows:
     """A random ordered subset of each rollout's rows.
 
@@ -67,16 +67,16 @@ def order_rows(
         rollouts: which ones, [B]; a rollout may occur more than once.
         size: n, the most rows of each.
         rng: draws the orders.
-        proposed_first: how often the tries that a policy proposed come first, in the order in which they were made
-            (AdaAfford, Training Strategy: AAP is fine-tuned with the proposed interactions).
+        continued_first: how often the tries that continued one another come first, in the order in which they were
+            made, as at test time (AdaAfford, Training Strategy: AAP is fine-tuned with the proposed interactions).
     """
-    orders, proposed = [], dataset.rows.proposed.numpy(force=True)
+    orders, continued = [], dataset.rows.continued.numpy(force=True)
     for number in rollouts:
         order = rng.permutation(dataset.rollouts[number].numpy())
-        if rng.random() < proposed_first:
+        if rng.random() < continued_first:
             # The rows of a rollout are in order of step, so that a sort by row is a sort by step.
-            first = np.array([row for row in dataset.rollouts[number].tolist() if proposed[row]], dtype=np.int64)
-            order = np.concatenate([first, order[~proposed[order]]])
+            first = np.array([row for row in dataset.rollouts[number].tolist() if continued[row]], dtype=np.int64)
+            order = np.concatenate([first, order[~continued[order]]])
         orders.append(order)
     return padded(dataset, orders, size)
 

@@ -95,18 +95,22 @@ class Adapter:
 
     @torch.inference_mode()
     def affordance(
-        self, observation: Observation, history: Sequence[Interaction], module: AdaptiveName = "aap"
+        self,
+        observation: Observation,
+        history: Sequence[Interaction],
+        module: AdaptiveName = "aap",
+        points: NDArray[np.int64] | None = None,
     ) -> Float32:
-        """A_I: the AAP actionability of every point after a history, [N], in [0, 1]."""
-        everywhere = np.arange(len(observation.points))
-        features, places = self.features(observation, module, everywhere), self.places(observation, everywhere)
+        """A_I: the AAP actionability after a history, in [0, 1], of every point, [N], or of those at `points` alone."""
+        asked = np.arange(len(observation.points)) if points is None else points
+        features, places = self.features(observation, module, asked), self.places(observation, asked)
         return self._adaptive(module).actionability(features, places, self.z(history, module)).numpy()
 
     @torch.inference_mode()
-    def prior_affordance(self, observation: Observation) -> Float32:
-        """A: Where2Act's actionability of every point, [N], in [0, 1]."""
-        everywhere = np.arange(len(observation.points))
-        features, places = self.features(observation, "prior", everywhere), self.places(observation, everywhere)
+    def prior_affordance(self, observation: Observation, points: NDArray[np.int64] | None = None) -> Float32:
+        """A: Where2Act's actionability, in [0, 1], of every point, [N], or of those at `points` alone."""
+        asked = np.arange(len(observation.points)) if points is None else points
+        features, places = self.features(observation, "prior", asked), self.places(observation, asked)
         return self.policy.prior.actionability(features, places).numpy()
 
     @torch.inference_mode()

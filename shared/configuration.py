@@ -134,6 +134,9 @@ class RolloutConfig(StrictModel):
     """As published: 32 for each object and draw of hidden dynamics."""
     order: Order = Order.RESTART
     """Order of the random interactions; those of AIP always continue, and come first."""
+    continued: int = Field(0, ge=0)
+    """Restart order: how many random interactions come first, each continuing the last, as tries do at test time. They
+    teach AAP what a try tells that begins where another ended, which is not what it tells from a state drawn anew."""
     actions_per_state: int = Field(8, ge=1)
     """Restart order: actions tried from one observed state."""
     edge_share: float | None = Field(None, ge=0, le=1)

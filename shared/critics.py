@@ -22,8 +22,10 @@ class Critic(Protocol):
 
     name: CriticName
 
-    def affordance(self, observation: Observation, history: Sequence[Interaction]) -> Float32:
-        """The actionability of every point after a history, [N], in [0, 1]."""
+    def affordance(
+        self, observation: Observation, points: NDArray[np.int64], history: Sequence[Interaction]
+    ) -> Float32:
+        """The actionability of the points at some indices after a history, [Q], in [0, 1]."""
         ...
 
     def predict(self, observation: Observation, actions: Sequence[Action], history: Sequence[Interaction]) -> Float32:
@@ -75,9 +77,11 @@ class Where2ActCritic:
         adapter.policy.require("prior")
         self.adapter = adapter
 
-    def affordance(self, observation: Observation, history: Sequence[Interaction]) -> Float32:
-        """Where2Act's actionability, [N]."""
-        return self.adapter.prior_affordance(observation)
+    def affordance(
+        self, observation: Observation, points: NDArray[np.int64], history: Sequence[Interaction]
+    ) -> Float32:
+        """Where2Act's actionability, [Q]."""
+        return self.adapter.prior_affordance(observation, points)
 
     def predict(self, observation: Observation, actions: Sequence[Action], history: Sequence[Interaction]) -> Float32:
         """Where2Act's scores, [A]."""
@@ -99,9 +103,11 @@ class AdaptiveCritic:
         self.name: CriticName = name
         self._module = name
 
-    def affordance(self, observation: Observation, history: Sequence[Interaction]) -> Float32:
-        """a_p|z, [N]."""
-        return self.adapter.affordance(observation, history, self._module)
+    def affordance(
+        self, observation: Observation, points: NDArray[np.int64], history: Sequence[Interaction]
+    ) -> Float32:
+        """a_p|z, [Q]."""
+        return self.adapter.affordance(observation, history, self._module, points)
 
     def predict(self, observation: Observation, actions: Sequence[Action], history: Sequence[Interaction]) -> Float32:
         """s_u|z, [A]."""
@@ -129,10 +135,12 @@ class AdaptationCritic:
         self.adapter = adapter
         self._network = adapter.policy.where2act_adaptation
 
-    def affordance(self, observation: Observation, history: Sequence[Interaction]) -> Float32:
-        """Where2Act's actionability, corrected, [N]."""
-        before = torch.from_numpy(self.adapter.prior_affordance(observation))
-        return self._corrected(before, observation, np.arange(len(before)), history).numpy()
+    def affordance(
+        self, observation: Observation, points: NDArray[np.int64], history: Sequence[Interaction]
+    ) -> Float32:
+        """Where2Act's actionability, corrected, [Q]."""
+        before = torch.from_numpy(self.adapter.prior_affordance(observation, points))
+        return self._corrected(before, observation, points, history).numpy()
 
     def predict(self, observation: Observation, actions: Sequence[Action], history: Sequence[Interaction]) -> Float32:
         """Where2Act's scores, corrected, [A]."""

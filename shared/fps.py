@@ -46,7 +46,7 @@ class FpsProposer(ABC):
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
         """The next try; never None."""
         candidates = movable_points(observation)
-        actionability = self.critic.affordance(observation, history)[candidates]
+        actionability = self.critic.affordance(observation, candidates, history)
         tried = np.array([interaction.action.point for interaction in history]).reshape(-1, 3)
         spread = distances_to(observation.points[candidates].astype(np.float64), tried)
         point = int(candidates[self.choose(spread, actionability)])

@@ -80,9 +80,9 @@ class ExploitProposer:
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
         """The action to execute; never None."""
         candidates = movable_points(observation)
-        scores = self.critic.affordance(observation, history)
+        scores = self.critic.affordance(observation, candidates, history)
         # A stable sort makes the choice among equal scores independent of the machine.
-        best_first = candidates[np.argsort(-scores[candidates], kind="stable")]
+        best_first = candidates[np.argsort(-scores, kind="stable")]
         point = int(self.rng.choice(best_first[:TOP_POINTS]))
         return best_action(self.critic, self.adapter, observation, point, history, self.rng)
 

@@ -97,7 +97,9 @@ class Role(StrEnum):
     CONTEXT = "context"
     """A test-time try that fills the set of interactions."""
     EXPLOIT = "exploit"
-    """The action that the adapted affordance chooses at the end (sample-success)."""
+    """The action that the adapted affordance chooses at the end, where the tries left the object (sample-success)."""
+    EXPLOIT_AT_START = "exploit-at-start"
+    """What it chooses where the tries began, so that methods can be compared on one state (start-success)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from cluster.judging import judge
 from collector.procedural.writing import generate
 from collector.worker import Worker
 from learner.bootstrap import ratio_interval
-from learner.evaluation import EvaluationRow
+from learner.evaluation import EvaluationRow, ObjectCounts
 from learner.metrics import f_score
 from shared.errors import UsageError
 from shared.methods import METHODS
@@ -72,17 +72,19 @@ def table_of(**values: object) -> Table:
     row = {
         **{"method": "ours-final", "budget": 2, "f_score": 0.5, "f_score_low": 0.25, "f_score_high": 0.75},
         **{"sample_success": None, "sample_success_low": None, "sample_success_high": None, "trials": 0},
+        **{"start_success": 0.4, "start_success_low": 0.2, "start_success_high": 0.6, "counts": {"object": ["a"]}},
         **{"best_f": 0.6, "bce": 0.5, "auc": None, "base_rate": 0.3, "mean_tries": 2.0, "gap_closed": None},
     }
-    return Table("push-faucet", 1, 4, 40, 2, "ab" * 32, (row | values,))
+    return Table("push-faucet", 1, 4, 40, 2, "ab" * 32, {"a": "cd" * 32}, (row | values,))
 
 
 def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     shown = as_markdown(table_of())
-    assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | - | 0 |" in shown
+    assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | - | 40.0 [20.0, 60.0] | 0 |" in shown
     assert "30.0% succeed" in shown
     read = list(csv.DictReader(io.StringIO(as_csv(table_of().rows))))
     assert (read[0]["f_score"], read[0]["auc"]) == ("0.5", "")
+    assert "counts" not in read[0]
 
 
 @pytest.mark.parametrize("name", sorted(METHODS))
@@ -127,7 +129,8 @@ def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) 
 
 def row_of(method: str, budget: int, f_score: float) -> EvaluationRow:
     figures = dict.fromkeys((field.name for field in dataclasses.fields(EvaluationRow)), 0.5)
-    return EvaluationRow(**figures | {"method": method, "budget": budget, "f_score": f_score})  # type: ignore[arg-type]
+    told = {"method": method, "budget": budget, "f_score": f_score, "counts": ObjectCounts(*[()] * 9)}
+    return EvaluationRow(**figures | told)  # type: ignore[arg-type]
 
 
 def test_where2act_stands_at_every_budget_and_the_oracle_closes_the_gap(

@@ -137,12 +137,12 @@ def test_context_and_questions_never_overlap(dataset: Dataset, seed: int, size: 
     assert torch.equal(ordered.clouds[ordered.cloud], dataset.rows.cloud[ordered.rows])
 
 
-def test_proposed_tries_come_first_in_their_own_order(dataset: Dataset) -> None:
-    proposed = torch.zeros(len(dataset.rows), dtype=torch.bool)
+def test_continued_tries_come_first_in_their_own_order(dataset: Dataset) -> None:
+    continued = torch.zeros(len(dataset.rows), dtype=torch.bool)
     tries = dataset.rollouts[2][[1, 5, 7]]
-    proposed[tries] = True
-    marked = dataclasses.replace(dataset, rows=dataclasses.replace(dataset.rows, proposed=proposed))
-    ordered = order_rows(marked, [2], 12, np.random.default_rng(0), proposed_first=1.0)
+    continued[tries] = True
+    marked = dataclasses.replace(dataset, rows=dataclasses.replace(dataset.rows, continued=continued))
+    ordered = order_rows(marked, [2], 12, np.random.default_rng(0), continued_first=1.0)
     assert ordered.rows[0, :3].tolist() == tries.tolist()
     assert sorted(ordered.rows[0].tolist()) == sorted(dataset.rollouts[2].tolist())
 

@@ -8,6 +8,7 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from safetensors.torch import load, save
 
@@ -61,7 +62,19 @@ def actions_of(observation: Observation, count: int) -> list[Action]:
     return [interaction.action for interaction in history_of(observation, count, seed=5)]
 
 
+def everywhere(observation: Observation) -> NDArray[np.int64]:
+    return np.arange(len(observation.points))
+
+
 # Critics at test time
+
+
+@pytest.mark.parametrize("name", CRITICS)
+def test_a_point_is_believed_the_same_whichever_are_asked_about_with_it(adapter: Adapter, name: CriticName) -> None:
+    observation = observation_of()
+    critic, history, some = critic_named(name, adapter), history_of(observation, 2), movable_points(observation)[::3]
+    whole = critic.affordance(observation, everywhere(observation), history)
+    np.testing.assert_allclose(critic.affordance(observation, some, history), whole[some], atol=1e-5)
 
 
 @pytest.mark.parametrize("name", CRITICS)
@@ -70,7 +83,7 @@ def test_the_order_of_the_history_does_not_matter(adapter: Adapter, name: Critic
     history = history_of(observation, 4)
     critic, actions = critic_named(name, adapter), actions_of(observation, 6)
     for believed in (
-        lambda tries: critic.affordance(observation, tries),
+        lambda tries: critic.affordance(observation, everywhere(observation), tries),
         lambda tries: critic.predict(observation, actions, tries),
     ):
         scores = believed(history)
@@ -94,18 +107,19 @@ def test_proposals_are_scored_like_single_actions(adapter: Adapter, name: Critic
 def test_with_no_history_adaptation_is_plain_where2act(adapter: Adapter) -> None:
     observation = observation_of()
     critic, actions = critic_named("where2act-adaptation", adapter), actions_of(observation, 6)
-    assert np.array_equal(critic.affordance(observation, []), adapter.prior_affordance(observation))
+    told = critic.affordance(observation, everywhere(observation), [])
+    assert np.array_equal(told, adapter.prior_affordance(observation))
     assert np.array_equal(critic.predict(observation, actions, []), adapter.prior_score(observation, actions))
 
 
 def test_a_success_raises_and_a_failure_lowers_what_adaptation_says(adapter: Adapter) -> None:
     observation = observation_of()
     critic = critic_named("where2act-adaptation", adapter)
-    before = critic.affordance(observation, [])
+    before = critic.affordance(observation, everywhere(observation), [])
     action = actions_of(observation, 1)[0]
     for success in (True, False):
         history = [Interaction(observation, action, Outcome(OutcomeKind.OK, 0.1, success))]
-        change = critic.affordance(observation, history) - before
+        change = critic.affordance(observation, everywhere(observation), history) - before
         assert (change > 0).all() if success else (change < 0).all()
         # |r - s_u| sim_pq, with similarities in (0, 1).
         surprise = abs(success - critic.predict(observation, [action], [])[0])
@@ -119,9 +133,8 @@ def test_before_training_interaction_says_what_the_prior_says() -> None:
     for history in ([], history_of(observation, 4)):
         told = critic.predict(observation, actions, history)
         np.testing.assert_allclose(told, adapter.prior_score(observation, actions), atol=1e-6)
-        np.testing.assert_allclose(
-            critic.affordance(observation, history), adapter.prior_affordance(observation), atol=1e-6
-        )
+        believed = critic.affordance(observation, everywhere(observation), history)
+        np.testing.assert_allclose(believed, adapter.prior_affordance(observation), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", BASELINES)
@@ -172,7 +185,7 @@ def test_each_try_is_the_farthest_among_the_actionable(adapter: Adapter, name: s
     actions = try_repeatedly(adapter, name, observation, 4)
     history: list[Interaction] = []
     for count, action in enumerate(actions):
-        scores = critic_named(critic, adapter).affordance(observation, history)[candidates]
+        scores = critic_named(critic, adapter).affordance(observation, candidates, history)
         among = candidates[actionable_points(scores)]
         assert action.point_index in among
         spread = distances_to(observation.points[among].astype(float), np.array([a.point for a in actions[:count]]))
@@ -197,9 +210,9 @@ def test_weighted_distance_begins_at_the_top_and_weighs_both(adapter: Adapter) -
     candidates = movable_points(observation)
     first, second = try_repeatedly(adapter, "argfps", observation, 2)
     critic = critic_named("aap", adapter)
-    assert first.point_index == candidates[critic.affordance(observation, [])[candidates].argmax()]
+    assert first.point_index == candidates[critic.affordance(observation, candidates, []).argmax()]
     history = [Interaction(observation, first, Outcome(OutcomeKind.OK, 0.0, False))]
-    weights = critic.affordance(observation, history)[candidates]
+    weights = critic.affordance(observation, candidates, history)
     distances = np.linalg.norm(observation.points[candidates] - first.point, axis=1)
     assert second.point_index == candidates[(distances * weights).argmax()]
     proposer = proposer_named("argfps", adapter, np.random.default_rng(0), 1)

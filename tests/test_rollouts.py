@@ -187,8 +187,11 @@ def test_evaluation_gives_every_method_the_same_start_and_the_same_questions(obj
         assert np.array_equal(rows[0].joint_positions, queries[0].joint_positions)
         tries = [row for row in rows if row.role is Role.CONTEXT]
         exploits = [row for row in rows if row.role is Role.EXPLOIT]
+        again = [row for row in rows if row.role is Role.EXPLOIT_AT_START]
         assert len(tries) == (0 if method == "where2act" else 2)
         assert [row.budget for row in exploits] == [1, 2]
+        assert [row.budget for row in again] == ([] if method == "where2act" else [1, 2])
+        assert all(np.array_equal(row.joint_positions, queries[0].joint_positions) for row in again)
         assert {row.proposer for row in tries} <= {"random", "aip"}
         assert {row.proposer for row in exploits} == {"where2act" if method == "where2act" else "aap"}
 

@@ -17,9 +17,13 @@ from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
 from shared.configuration import parse
 from shared.methods import METHODS
 
-Measure = Literal["f_score", "sample_success"]
-MEASURES: tuple[tuple[Measure, str], ...] = (("f_score", "F-score"), ("sample_success", "sample-success"))
-"""What is compared, and what people call it; in percent on the page."""
+Measure = Literal["f_score", "sample_success", "start_success"]
+MEASURES: tuple[tuple[Measure, str], ...] = (
+    ("f_score", "F-score"),
+    ("sample_success", "sample-success"),
+    ("start_success", "from the start"),
+)
+"""What is compared, and what people call it; in percent on the page. The paper has no figures of the last."""
 WITHOUT_TRIES = (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD)
 BEST_METHOD = "ours-final"
 
@@ -37,6 +41,9 @@ class ResultRow(BaseModel):
     sample_success: float | None
     sample_success_low: float | None = None
     sample_success_high: float | None = None
+    start_success: float | None = None
+    start_success_low: float | None = None
+    start_success_high: float | None = None
     trials: int
     gap_closed: float | None = None
     best_f: float | None
@@ -48,14 +55,12 @@ class ResultRow(BaseModel):
 
     def value(self, measure: Measure) -> float | None:
         """One of the measures."""
-        return self.f_score if measure == "f_score" else self.sample_success
+        found: float | None = getattr(self, measure)
+        return found
 
     def interval(self, measure: Measure) -> tuple[float, float] | None:
         """The limits of its 95% interval; None where it has none."""
-        if measure == "f_score":
-            low, high = self.f_score_low, self.f_score_high
-        else:
-            low, high = self.sample_success_low, self.sample_success_high
+        low, high = (getattr(self, f"{measure}_{end}") for end in ("low", "high"))
         return None if low is None or high is None else (low, high)
 
 
@@ -108,7 +113,7 @@ class Results:
     def of_paper(self, method: str, budget: int, measure: Measure) -> float | None:
         """The paper's own figure, percent, where we have a row as well."""
         told = {str(name): each for name, each in published(self.task, novel_categories=self.novel_categories).items()}
-        if method not in told or self.row(method, budget) is None:
+        if measure == "start_success" or method not in told or self.row(method, budget) is None:
             return None
         return told[method].at(budget, measure)
 
@@ -138,7 +143,8 @@ def results_section(results: Results) -> Section:
     """The table and the curves of the run's own evaluation."""
     lead: tuple[str, ...] = (
         "F-score: whether the critic tells, at the threshold 0.5, which random interactions with unseen objects "
-        "succeed. Sample-success: whether what the adapted affordance chooses succeeds when it is executed. In "
+        "succeed. Sample-success: whether what the adapted affordance chooses succeeds when it is executed where the "
+        "tries left the object, as in the paper; from the start: where they began, a state that all methods share. In "
         "percent; the small figures are the limits of the 95% interval over objects. Bold: the best of a column, the "
         "oracle left out, which is told the hidden facts.",
     )
@@ -182,21 +188,22 @@ def tiles(results: Results) -> tuple[Tile, ...]:
 def table_of(results: Results, caption: str = "") -> Table:
     """Methods by budgets, beside the paper's."""
     columns = [(measure, budget) for measure, _ in MEASURES for budget in results.budgets]
-    width = (2 if results.has_paper else 1) * len(results.budgets)
+    beside = {measure for measure, _ in MEASURES if results.has_paper and measure != "start_success"}
     second: Row = (Cell("tries", kind="name"),)
-    for _, budget in columns:
-        second += (Cell(str(budget)), *([Cell("paper", kind="paper")] if results.has_paper else []))
+    for measure, budget in columns:
+        second += (Cell(str(budget)), *([Cell("paper", kind="paper")] if measure in beside else []))
     body = []
     for method in results.methods:
         cells: Row = (Cell(method, kind="name"),)
         for measure, budget in columns:
             to_beat = None if method == ORACLE_METHOD else results.best(measure, budget)
             cells += (_cell(results.row(method, budget), measure, to_beat),)
-            if results.has_paper:
+            if measure in beside:
                 paper = results.of_paper(method, budget, measure)
                 cells += (Cell("" if paper is None else f"{paper:.1f}", kind="paper"),)
         body.append(cells)
-    first: Row = (Cell("method", kind="name"), *(Cell(name, span=width) for _, name in MEASURES))
+    spans = [(name, (2 if measure in beside else 1) * len(results.budgets)) for measure, name in MEASURES]
+    first: Row = (Cell("method", kind="name"), *(Cell(name, span=span) for name, span in spans))
     return Table((first, second), tuple(body), caption)
 
 
@@ -219,7 +226,8 @@ def _cell(row: ResultRow | None, measure: Measure, best: float | None) -> Cell:
 
 
 def _curves(results: Results) -> Drawing:
-    figure = make_subplots(1, 2, subplot_titles=[f"{name} (%)" for _, name in MEASURES], horizontal_spacing=0.09)
+    titles = [f"{name} (%)" for _, name in MEASURES]
+    figure = make_subplots(1, len(MEASURES), subplot_titles=titles, horizontal_spacing=0.06)
     for column, (measure, _) in enumerate(MEASURES, start=1):
         for method in results.methods:
             curve = _level(results, method, measure) if method in WITHOUT_TRIES else _curve(results, method, measure)

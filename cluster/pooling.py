@@ -1,0 +1,332 @@
+"""One table of several runs of a task, such as seeds of one campaign: pooled, run by run, beside the paper's figures.
+
+An object that several runs were tested on counts once, with the trials of all of them.
+
+Files: comparison.md and comparison.png for people, comparison.csv and comparison.json for programs.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from pydantic import BaseModel, ConfigDict, Field
+
+from cluster.evaluation_tables import RESULTS_FILE, as_csv
+from cluster.reporting.published import published
+from cluster.reporting.style import COLOURS, SOFT
+from cluster.run_folder import RunFolder, find, read_json
+from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD, ObjectCounts
+from learner.training import without_nan
+from shared.configuration import parse
+from shared.errors import UsageError
+from shared.files import write_atomically
+from shared.methods import METHODS
+
+MARKDOWN_FILE, CSV_FILE, JSON_FILE, FIGURE_FILE = (f"comparison.{kind}" for kind in ("md", "csv", "json", "png"))
+MEASURES = {"f_score": "F-score", "sample_success": "sample-success", "start_success": "from the start"}
+AVERAGED = ("best_f", "bce", "auc", "base_rate", "mean_tries")
+"""Figures that do not follow from counts: their means over runs."""
+
+_COLUMNS = (
+    *("method", "tries", "F-score", "paper", "sample-success", "paper", "from the start"),
+    *("gap closed", "best F", "BCE", "AUC"),
+)
+
+_Counts = tuple[Annotated[int, Field(ge=0, le=1 << 40)], ...]
+_COUNTED = tuple(field.name for field in fields(ObjectCounts) if field.name != "object")
+
+
+class _Columns(BaseModel):
+    """`learner.evaluation.ObjectCounts` as it was written."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    object: tuple[Annotated[str, Field(max_length=200)], ...]
+    queries: _Counts
+    true: _Counts
+    claimed: _Counts
+    hits: _Counts
+    trials: _Counts
+    successes: _Counts
+    start_trials: _Counts
+    start_successes: _Counts
+
+
+class _Row(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    method: str = Field(max_length=100)
+    budget: int
+    best_f: float | None
+    bce: float | None
+    auc: float | None
+    base_rate: float | None
+    mean_tries: float | None
+    counts: _Columns
+
+
+class _Results(BaseModel):
+    """What is read of results.json."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    task: str = Field(max_length=100)
+    seed: int
+    rollouts: int
+    contents: Mapping[str, str]
+    rows: tuple[_Row, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PooledRow:
+    """A method at a budget over all runs; shares with their 95% intervals over objects, None for no figure.
+
+    Attributes:
+        method: which method.
+        budget: how many tries.
+        shares: of each of `MEASURES`: the figure, and where its interval begins and ends.
+        by_run: of each of `MEASURES`: the figure in each run.
+        gap_closed: the share of the gap in F-score between Where2Act and the oracle.
+        trials: how many actions were executed where tries had left an object.
+        averages: of each of `AVERAGED`, the mean over runs.
+    """
+
+    method: str
+    budget: int
+    shares: Mapping[str, tuple[float, float, float]]
+    by_run: Mapping[str, tuple[float, ...]]
+    gap_closed: float
+    trials: int
+    averages: Mapping[str, float]
+
+    def flat(self) -> dict[str, Any]:
+        """One column each, for CSV and JSON."""
+        flat: dict[str, Any] = {"method": self.method, "budget": self.budget}
+        for name, (value, low, high) in self.shares.items():
+            flat |= {name: value, f"{name}_low": low, f"{name}_high": high}
+            flat |= {f"{name}_run_{number}": each for number, each in enumerate(self.by_run[name], start=1)}
+        return without_nan(flat | {"gap_closed": self.gap_closed, "trials": self.trials} | dict(self.averages))
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What came of pooling.
+
+    Attributes:
+        task: of all runs.
+        seeds: of the runs' evaluations.
+        rollouts: trials in all runs.
+        objects: different objects that were tested on.
+        base_rate: of success among random interactions, mean over runs.
+        rows: in the order of the paper's tables.
+    """
+
+    task: str
+    seeds: tuple[int, ...]
+    rollouts: int
+    objects: int
+    base_rate: float
+    rows: tuple[PooledRow, ...]
+
+
+def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
+    """Pool evaluations of several runs.
+
+    Args:
+        runs: their folders.
+        evaluation: the name of a folder in each RUN/evaluations; None: the evaluation that a run ends with.
+
+    Raises:
+        UsageError: a folder is no run or lacks the evaluation, the runs are of different tasks, or share no method.
+        StoreError: a file is damaged.
+    """
+    results = [_read(find(path)[0], evaluation) for path in runs]
+    if len(tasks := sorted({each.task for each in results})) > 1:
+        raise UsageError(f"the runs are of different tasks ({', '.join(tasks)}); give runs of one task")
+    common = set.intersection(*({(row.method, row.budget) for row in each.rows} for each in results))
+    if not common:
+        raise UsageError("the runs share no method and budget; evaluate them alike")
+    rows = [_pooled(method, budget, results) for method, budget in sorted(common, key=_place)]
+    prior, oracle = (_share_of(rows, method) for method in (PRIOR_METHOD, ORACLE_METHOD))
+    return Comparison(
+        task=tasks[0],
+        seeds=tuple(each.seed for each in results),
+        rollouts=sum(each.rollouts for each in results),
+        objects=len({content for each in results for content in each.contents.values()}),
+        base_rate=rows[0].averages["base_rate"],
+        rows=tuple(replace(row, gap_closed=_part_of(prior, row.shares["f_score"][0], oracle)) for row in rows),
+    )
+
+
+def _read(run: RunFolder, evaluation: str | None) -> _Results:
+    folder = run.training("evaluate") if evaluation is None else run.evaluations / evaluation
+    if not (folder / RESULTS_FILE).is_file():
+        known = sorted(path.parent.name for path in run.evaluations.glob(f"*/{RESULTS_FILE}"))
+        there = f"it has {', '.join(known)}" if known else "finish the run, or evaluate it, first"
+        raise UsageError(f"{folder}: holds no {RESULTS_FILE}; {there}")
+    return parse(_Results, read_json(folder / RESULTS_FILE), str(folder / RESULTS_FILE))
+
+
+def _place(key: tuple[str, int]) -> tuple[int, str, int]:
+    """In the order of the paper's tables, and then what stands beside them."""
+    order = [*METHODS, NO_TRIES_METHOD, ORACLE_METHOD]
+    method, budget = key
+    return order.index(method) if method in order else len(order), method, budget
+
+
+def _pooled(method: str, budget: int, results: Sequence[_Results]) -> PooledRow:
+    rows = [next(row for row in each.rows if (row.method, row.budget) == (method, budget)) for each in results]
+    counts = [ObjectCounts(**dict(row.counts)) for row in rows]
+    together = _together([_by_content(each, contents.contents) for each, contents in zip(counts, results, strict=True)])
+    averages = {}
+    for name in AVERAGED:
+        known = [value for row in rows if (value := getattr(row, name)) is not None]
+        averages[name] = float(np.mean(known)) if known else math.nan
+    return PooledRow(
+        method=method,
+        budget=budget,
+        shares={name: getattr(together, name)() for name in MEASURES},
+        by_run={name: tuple(getattr(each, name)()[0] for each in counts) for name in MEASURES},
+        gap_closed=math.nan,
+        trials=sum(together.trials),
+        averages=averages,
+    )
+
+
+def _by_content(counts: ObjectCounts, contents: Mapping[str, str]) -> ObjectCounts:
+    """With objects called by what they are."""
+    return replace(counts, object=tuple(contents.get(name, name) for name in counts.object))
+
+
+def _together(counts: Sequence[ObjectCounts]) -> ObjectCounts:
+    """The sums over runs, by object."""
+    names = sorted({name for each in counts for name in each.object})
+    numbers = {name: number for number, name in enumerate(names)}
+    sums = {name: np.zeros(len(names), dtype=np.int64) for name in _COUNTED}
+    for each in counts:
+        for name in _COUNTED:
+            np.add.at(sums[name], [numbers[own] for own in each.object], getattr(each, name))
+    return ObjectCounts(object=tuple(names), **{name: tuple(column.tolist()) for name, column in sums.items()})
+
+
+def _share_of(rows: Sequence[PooledRow], method: str) -> float:
+    return next((row.shares["f_score"][0] for row in rows if row.method == method), math.nan)
+
+
+def _part_of(low: float, value: float, high: float) -> float:
+    """How far a value is from the one to the other; NaN where there is no way to go."""
+    return (value - low) / (high - low) if high > low else math.nan
+
+
+def write_comparison(out: Path, comparison: Comparison) -> None:
+    """Write the four files; comparison.json comes last."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows = [row.flat() for row in comparison.rows]
+    write_atomically(out / CSV_FILE, as_csv(rows).encode())
+    write_atomically(out / MARKDOWN_FILE, as_markdown(comparison).encode())
+    draw_comparison(comparison, out / FIGURE_FILE)
+    told = {"task": comparison.task, "seeds": comparison.seeds, "objects": comparison.objects, "rows": rows}
+    write_atomically(out / JSON_FILE, json.dumps(told, indent=1, allow_nan=False).encode())
+
+
+def as_markdown(comparison: Comparison) -> str:
+    """The pooled table beside the paper's figures, and the table run by run."""
+    paper = {str(name): each for name, each in published(comparison.task, novel_categories=False).items()}
+    seeds = ", ".join(map(str, comparison.seeds))
+    lines = [
+        f"# {comparison.task}: all methods",
+        "",
+        f"{comparison.rollouts} trials on {comparison.objects} objects that no training saw, {len(comparison.seeds)} "
+        f"runs (seeds {seeds}). In percent; in brackets 95% bootstrap intervals over objects, all runs together. "
+        "F-score of the critic at threshold 0.5 on random interactions, of which "
+        f"{_percent(comparison.base_rate)}% succeed. Sample-success: of the chosen action where the tries left the "
+        "object, as in the paper; from the start: where they began. Gap closed: of that in F-score between Where2Act "
+        "and the oracle, which is told the hidden facts. The paper's figures are of other objects and another "
+        "simulator: orders and trends can be compared.",
+        "",
+        f"| {' | '.join(_COLUMNS)} |",
+        "| --- |" + " ---: |" * (len(_COLUMNS) - 1),
+    ]
+    for row in comparison.rows:
+        told = paper.get(row.method)
+        cells = [
+            row.method,
+            str(row.budget),
+            _interval(row.shares["f_score"]),
+            _percent_of_paper(told.at(row.budget, "f_score") if told else None),
+            _interval(row.shares["sample_success"]),
+            _percent_of_paper(told.at(row.budget, "sample_success") if told else None),
+            _interval(row.shares["start_success"]),
+            _percent(row.gap_closed),
+            _percent(row.averages["best_f"]),
+            _number(row.averages["bce"]),
+            _number(row.averages["auc"]),
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    runs = [f"seed {seed}" for seed in comparison.seeds]
+    lines += [
+        "",
+        "Run by run (F-score / sample-success / from the start):",
+        "",
+        "| method | tries | " + " | ".join(runs) + " |",
+        "| --- | ---: |" + " ---: |" * len(runs),
+    ]
+    for row in comparison.rows:
+        each = zip(*(row.by_run[name] for name in MEASURES), strict=True)
+        shown = [" / ".join(map(_percent, values)) for values in each]
+        lines.append(f"| {row.method} | {row.budget} | " + " | ".join(shown) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def draw_comparison(comparison: Comparison, path: Path) -> None:
+    """Each measure against the number of tries: a curve for each method, level lines for what tries nothing."""
+    figure = Figure(figsize=(13, 5), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(MEASURES))
+    methods = list(dict.fromkeys(row.method for row in comparison.rows))
+    colours = {method: COLOURS.get(method, SOFT) for method in methods}
+    for axes, (measure, name) in zip(panels, MEASURES.items(), strict=True):
+        for method in methods:
+            rows = [row for row in comparison.rows if row.method == method]
+            values = [100 * row.shares[measure][0] for row in rows]
+            budgets = [row.budget for row in rows]
+            if method in (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD):
+                axes.axhline(values[0], color=colours[method], linestyle="--", linewidth=1.2, label=method)
+                continue
+            ours = method == "ours-final"
+            axes.plot(budgets, values, "o-", color=colours[method], linewidth=3 if ours else 1.3, label=method)
+            if ours:
+                low, high = ([100 * row.shares[measure][end] for row in rows] for end in (1, 2))
+                axes.fill_between(budgets, low, high, color=colours[method], alpha=0.15, linewidth=0)
+        axes.set_title(f"{name} (%)", fontsize=10)
+        axes.set_xlabel("tries")
+        axes.set_xticks(sorted({row.budget for row in comparison.rows if row.budget}))
+        axes.grid(alpha=0.3)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+    figure.suptitle(
+        f"{comparison.task}: {comparison.objects} unseen objects, {len(comparison.seeds)} runs", fontsize=10
+    )
+    figure.savefig(path, format="png")
+
+
+def _interval(share: tuple[float, float, float]) -> str:
+    value, low, high = share
+    return "-" if math.isnan(value) else f"{100 * value:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def _percent(value: float) -> str:
+    return "-" if math.isnan(value) else f"{100 * value:.1f}"
+
+
+def _percent_of_paper(value: float | None) -> str:
+    return "" if value is None else f"*{value:.1f}*"
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3f}"
