@@ -1,7 +1,7 @@
 """The campaign: the alternation of collection and training as a list of stages over one folder.
 
     objects, collect-random, train-prior,
-    train-aap-1, train-aip-1, publish-1,
+    train-aap-1, train-aip-1, publish-1,        (a run that starts from a policy has `adopt` for the three trainings)
     collect-aip-1, train-aap-2, train-aip-2, publish-2, ...
     (before the last publication train-where2act-interaction, train-where2act-adaptation, where they are evaluated)
     evaluate, report
@@ -11,12 +11,14 @@ The same live workers serve every collection round; each round's policy reaches 
 
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from cluster.adoption import fit_to_start_from, seen_by
 from cluster.collection import collect
 from cluster.configuration import CampaignConfig
 from cluster.evaluation import Evaluation, figures_of
@@ -86,11 +88,11 @@ class Campaign:
 
     def stages(self, crew: Crew) -> list[Stage]:
         """All stages, in order."""
-        trainer = self._trainer
+        trainer, adopted = self._trainer, self._config.start_from is not None
         stages = [
             Stage("objects", self._choose_objects),
             Stage("collect-random", partial(self._collect, crew, "random", 0, self._config.rollouts.random)),
-            Stage("train-prior", trainer.prior),
+            Stage("adopt", trainer.adopt) if adopted else Stage("train-prior", trainer.prior),
         ]
         final = self._config.alternations + 1
         for version in range(1, final + 1):
@@ -99,11 +101,12 @@ class Campaign:
                 stages.append(
                     Stage(f"collect-aip-{version - 1}", partial(self._collect, crew, "aip", version - 1, count))
                 )
-            stages += [
-                Stage(f"train-aap-{version}", partial(trainer.aap, version)),
-                Stage(f"train-aip-{version}", partial(trainer.aip, version)),
-            ]
-            last = f"aip-{version}"
+            last = "adopted" if adopted and version == 1 else f"aip-{version}"
+            if last != "adopted":
+                stages += [
+                    Stage(f"train-aap-{version}", partial(trainer.aap, version)),
+                    Stage(f"train-aip-{version}", partial(trainer.aip, version)),
+                ]
             for name in baselines_of(self._config.evaluation.methods) if version == final else ():
                 stages.append(Stage(f"train-{name}", partial(trainer.baseline, name, last)))
                 last = name
@@ -118,6 +121,10 @@ class Campaign:
         built_in, lists = run.generated_objects.resolve(), lists_of(config.splits)
         catalogue, folder = objects_for(task, config, built_in, per_category, config.seed, lists)
         parts = split_as_told((entry.ref for entry in catalogue.usable), config.splits, config.seed)
+        if config.start_from is not None:
+            fit_to_start_from(config.start_from, config.task)
+            seen = seen_by(config.start_from)
+            parts = replace(parts, test=tuple(ref for ref in parts.test if ref.content_hash not in seen))
         if not parts.train or not parts.test:
             raise UsageError(
                 f"{folder}: {len(catalogue.usable)} usable objects are too few to train on some and test on others"

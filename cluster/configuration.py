@@ -99,6 +99,9 @@ class CampaignConfig(ObjectSelection):
     """Everything random derives from it."""
     alternations: int = Field(1, ge=0, le=1000)
     """AIP rounds, each followed by training."""
+    start_from: str | None = Field(None, min_length=1, max_length=4096)
+    """A policy to fine-tune on these objects, instead of training one from nothing: a finished run, a folder with a
+    policy, or a name of those that the package brings. Its version is 1."""
     rollouts: RolloutCounts = RolloutCounts()
     splits: SplitConfig = SplitConfig()
     procedural: ProceduralConfig = ProceduralConfig()
@@ -114,6 +117,18 @@ class CampaignConfig(ObjectSelection):
     quarantined."""
     memory_limit_mb: float = Field(2000.0, gt=0)
     """What a worker may take beyond what it had after its start; at half of that it is replaced after its job."""
+
+    @model_validator(mode="after")
+    def _something_to_train(self) -> "CampaignConfig":
+        if self.start_from is not None and not self.alternations:
+            raise ValueError("start_from fine-tunes in AIP rounds, so alternations must be at least 1; given 0")
+        return self
+
+    @field_validator("start_from")
+    @classmethod
+    def _found_from_anywhere(cls, source: str | None) -> str | None:
+        """A run may be resumed from another working folder."""
+        return str(Path(source).resolve()) if source is not None and Path(source).exists() else source
 
     @property
     def limits(self) -> Limits:

@@ -160,13 +160,16 @@ class _Costs:
         """As `cluster.campaign.Campaign.stages` has them; what costs next to nothing is left out."""
         rollouts, learner = self.config.rollouts, self.config.learner
         yield self._collection("collect-random", rollouts.total(rollouts.random, self.collected_on), tries=0)
-        yield self._training("train-prior", self._prior_s())
+        adopted = self.config.start_from is not None
+        if not adopted:
+            yield self._training("train-prior", self._prior_s())
         for version in range(1, self.config.alternations + 2):
             if version > 1:
                 count = rollouts.total(rollouts.aip, self.collected_on)
                 yield self._collection(f"collect-aip-{version - 1}", count, self.config.collection.rollout.context)
-            yield self._training(f"train-aap-{version}", self._aap_s(first=version == 1))
-            yield self._training(f"train-aip-{version}", self._aip_s())
+            if version > 1 or not adopted:
+                yield self._training(f"train-aap-{version}", self._aap_s(first=version == 1))
+                yield self._training(f"train-aip-{version}", self._aip_s())
         for name in baselines_of(self.config.evaluation.methods):
             if name == "where2act-interaction":
                 told = learner.interaction
@@ -195,7 +198,8 @@ class _Costs:
         told = self.config.evaluation
         methods = [METHODS[name] for name in told.methods]
         tries = [max(method.budgets(told.budgets)) if method.tries else 0 for method in methods]
-        chosen = sum(len(method.budgets(told.budgets)) for method in methods)
+        # Twice where there are tries: where these left the object, and where they began.
+        chosen = sum(len(method.budgets(told.budgets)) * (2 if method.tries else 1) for method in methods)
         by_policy = chosen + sum(n for n, m in zip(tries, methods, strict=True) if m.tries in (*FPS_PROPOSERS, "aip"))
         interactions = rollouts * (told.queries + sum(tries) + chosen)
         clouds = rollouts * (1 + sum(tries))
@@ -258,12 +262,13 @@ class _Costs:
         return 3 * FORWARD_SHARE * self.encode_s + 2 * (points + 100) * self.rates.scored_row_s
 
     def _clouds_a_rollout(self, tries: int) -> int:
-        """How often a rollout looks: before each try that a policy chose, then before each state's random ones."""
+        """How often a rollout looks: before each try that continues the last, then before each state's random ones."""
         told = self.config.collection.rollout
-        left = max(0, told.interactions - tries)
         if told.order is Order.CONTINUE and not tries:
-            return left
-        return tries + (min(left, 1) if self.task.closed else -(-left // told.actions_per_state))
+            return told.interactions
+        continued = min(tries or told.continued, told.interactions)
+        left = told.interactions - continued
+        return continued + (min(left, 1) if self.task.closed else -(-left // told.actions_per_state))
 
     def _stored_bytes(self, rollouts: int, interactions: int, clouds: int) -> float:
         rates, points = self.rates, self.config.collection.camera.points

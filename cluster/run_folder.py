@@ -90,7 +90,12 @@ class RunFolder:
     @property
     def oracle(self) -> Path:
         """The training stage that may have left an oracle."""
-        return self.training("aap-1")
+        return self.adopted if self.adopted.is_dir() else self.training("aap-1")
+
+    @property
+    def adopted(self) -> Path:
+        """The policy that the run went on from, if it did (`cluster.adoption`)."""
+        return self.training("adopted")
 
     @property
     def page(self) -> Path:

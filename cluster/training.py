@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cluster.adoption import adopt
 from cluster.configuration import CampaignConfig
 from cluster.run_folder import RunFolder
 from learner.configuration import LearnerConfig
@@ -29,6 +30,7 @@ class Trainer:
     """The training stages of one run; each starts from what the last one left, and leaves a whole policy.
 
     prior -> aap-1 -> aip-1 (published as 1) -> aap-2 -> aip-2 (published as 2) -> ...
+    adopted (published as 1)                 -> aap-2 -> ..., where the run starts from a policy
 
     Baselines that the evaluation wants are trained before the last publication.
     """
@@ -44,7 +46,15 @@ class Trainer:
 
     def aap(self, version: int) -> Mapping[str, Any]:
         """AAP: from the prior at first, then fine-tuned with what its own AIP chose to try."""
-        return self._train("aap", f"aap-{version}", "prior" if version == 1 else f"aip-{version - 1}")
+        before = "adopted" if version == 2 and self._config.start_from is not None else f"aip-{version - 1}"
+        return self._train("aap", f"aap-{version}", "prior" if version == 1 else before)
+
+    def adopt(self) -> Mapping[str, Any]:
+        """The policy that the run starts from, in place of one trained from nothing."""
+        source = self._config.start_from
+        assert source is not None, "the run starts from a policy"
+        adopt(source, self._config.task, self._run.adopted)
+        return {"policy_folder": str(self._run.adopted.relative_to(self._run.path))}
 
     def aip(self, version: int) -> Mapping[str, Any]:
         """AIP, for the AAP of the same version."""
