@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cluster.evaluation_tables import RESULTS_FILE, as_csv
 from cluster.reporting.published import published
@@ -56,6 +56,12 @@ class _Columns(BaseModel):
     successes: _Counts
     start_trials: _Counts
     start_successes: _Counts
+
+    @model_validator(mode="after")
+    def _of_the_same_objects(self) -> "_Columns":
+        if len({len(getattr(self, name)) for name in ("object", *_COUNTED)}) > 1:
+            raise ValueError("columns of different lengths; evaluate again")
+        return self
 
 
 class _Row(BaseModel):
@@ -146,6 +152,8 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         UsageError: a folder is no run or lacks the evaluation, the runs are of different tasks, or share no method.
         StoreError: a file is damaged.
     """
+    if not runs or len({path.resolve() for path in runs}) < len(runs):
+        raise UsageError("name the folders of one run or several, each once")
     results = [_read(find(path)[0], evaluation) for path in runs]
     if len(tasks := sorted({each.task for each in results})) > 1:
         raise UsageError(f"the runs are of different tasks ({', '.join(tasks)}); give runs of one task")

@@ -1,0 +1,118 @@
+"""Several runs as one table: sums of counts by object, each run beside, and the paper's figures."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cluster.cli import run as adaafford
+from cluster.configuration import CampaignConfig
+from cluster.evaluation_tables import RESULTS_FILE
+from cluster.pooling import CSV_FILE, FIGURE_FILE, JSON_FILE, MARKDOWN_FILE, Comparison, pool, write_comparison
+from cluster.run_folder import begin
+from learner.bootstrap import ratio_interval
+from shared.errors import UsageError
+
+METHODS = (("where2act", 1), ("oracle", 0), ("ours-final", 1))
+
+
+def counts_of(rng: np.random.Generator, objects: tuple[str, ...]) -> dict[str, list[object]]:
+    queries = rng.integers(10, 20, len(objects))
+    true = rng.binomial(queries, 0.5)
+    claimed_true = rng.binomial(true, 0.7)
+    trials = rng.integers(1, 5, len(objects))
+    columns = {
+        "queries": queries,
+        "true": true,
+        "claimed": claimed_true + rng.binomial(queries - true, 0.3),
+        "hits": claimed_true,
+        "trials": trials,
+        "successes": rng.binomial(trials, 0.6),
+        "start_trials": trials,
+        "start_successes": rng.binomial(trials, 0.5),
+    }
+    return {"object": list(objects)} | {name: column.tolist() for name, column in columns.items()}
+
+
+def make_run(
+    path: Path, seed: int, contents: dict[str, str], task: str = "push-faucet"
+) -> dict[str, dict[str, list[int]]]:
+    """A run with made-up results; returns the counts of each method."""
+    rng = np.random.default_rng(seed)
+    run = begin(path, CampaignConfig(task=task))
+    counts = {method: counts_of(rng, tuple(contents)) for method, _ in METHODS}
+    figures = {"best_f": 0.5, "bce": 0.4, "auc": None, "base_rate": 0.25 + 0.1 * seed, "mean_tries": 1.0}
+    rows = [{"method": m, "budget": b, "counts": counts[m], **figures} for m, b in METHODS]
+    document = {"task": task, "seed": seed, "rollouts": 10, "contents": contents, "rows": rows}
+    run.training("evaluate").mkdir(parents=True)
+    (run.training("evaluate") / RESULTS_FILE).write_text(json.dumps(document))
+    return counts  # type: ignore[return-value]
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> tuple[list[Path], list[dict[str, dict[str, list[int]]]]]:
+    """Two runs: "a" is another object in each, "b" the same in both."""
+    told = ({"a": "1" * 64, "b": "9" * 64}, {"a": "2" * 64, "b": "9" * 64})
+    paths = [tmp_path / "one", tmp_path / "two"]
+    return paths, [
+        make_run(path, seed, contents) for seed, (path, contents) in enumerate(zip(paths, told, strict=True))
+    ]
+
+
+def test_figures_are_of_all_trials_and_intervals_of_objects(
+    runs: tuple[list[Path], list[dict[str, dict[str, list[int]]]]],
+) -> None:
+    paths, counts = runs
+    found = pool(paths, None)
+    one, two = (each["ours-final"] for each in counts)
+    row = found.rows[[(row.method, row.budget) for row in found.rows].index(("ours-final", 1))]
+    hits, named = (sum(one[name]) + sum(two[name]) for name in ("hits", "true"))
+    claimed = sum(one["claimed"]) + sum(two["claimed"])
+    assert row.shares["f_score"][0] == pytest.approx(2 * hits / (claimed + named))
+    # "b" of both runs is one object; "a" is two.
+    successes = [one["successes"][0], two["successes"][0], one["successes"][1] + two["successes"][1]]
+    trials = [one["trials"][0], two["trials"][0], one["trials"][1] + two["trials"][1]]
+    assert row.shares["sample_success"][1:] == pytest.approx(ratio_interval(successes, trials, [0, 1, 2]))
+    assert found.objects == 3
+    assert found.base_rate == pytest.approx(0.3)
+    assert row.by_run["sample_success"][1] == pytest.approx(sum(two["successes"]) / sum(two["trials"]))
+    prior, oracle = (next(r for r in found.rows if r.method == name) for name in ("where2act", "oracle"))
+    low, high = prior.shares["f_score"][0], oracle.shares["f_score"][0]
+    expected = (row.shares["f_score"][0] - low) / (high - low) if high > low else float("nan")
+    assert row.gap_closed == pytest.approx(expected, nan_ok=True)
+
+
+def test_the_files_hold_it(runs: tuple[list[Path], object], tmp_path: Path) -> None:
+    found: Comparison = pool(runs[0], None)
+    write_comparison(tmp_path / "out", found)
+    text = (tmp_path / "out" / MARKDOWN_FILE).read_text()
+    assert "*77.4*" in text  # The paper's F-score of ours-final after one try.
+    assert "seed 0 | seed 1" in text
+    read = list(csv.DictReader((tmp_path / "out" / CSV_FILE).read_text().splitlines()))
+    assert [row["method"] for row in read] == ["where2act", "ours-final", "oracle"]
+    assert float(read[1]["f_score"]) == pytest.approx(found.rows[1].shares["f_score"][0])
+    assert json.loads((tmp_path / "out" / JSON_FILE).read_text())["seeds"] == [0, 1]
+    assert (tmp_path / "out" / FIGURE_FILE).read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_cannot_be_pooled_is_said_in_a_line(
+    runs: tuple[list[Path], object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_run(tmp_path / "door", 3, {"a": "3" * 64}, task="pull-closed-door")
+    for arguments, message in (
+        ([str(runs[0][0]), str(tmp_path / "door")], "different tasks (pull-closed-door, push-faucet)"),
+        ([str(tmp_path)], "holds no run"),
+        ([str(runs[0][0]), "--evaluation", "real"], "finish the run, or evaluate it, first"),
+        ([], "name the folders"),
+        ([str(runs[0][0])] * 2, "each once"),
+    ):
+        assert adaafford(["compare", *arguments]) == 2
+        assert message in capsys.readouterr().err.splitlines()[-1]
+    path = runs[0][0] / "training" / "evaluate" / RESULTS_FILE
+    whole = path.read_text()
+    for damage, message in (("-1, ", "queries"), ("7, ", "different lengths")):
+        path.write_text(whole.replace('"queries": [', f'"queries": [{damage}'))
+        with pytest.raises(UsageError, match=message):
+            pool(runs[0], None)
