@@ -10,14 +10,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cluster.evaluation_tables import RESULTS_FILE, as_csv
+from cluster.evaluation_tables import MEASURES, RESULTS_FILE, as_csv
 from cluster.reporting.published import published
 from cluster.reporting.style import COLOURS, SOFT
 from cluster.run_folder import RunFolder, find, read_json
@@ -29,39 +29,18 @@ from shared.files import write_atomically
 from shared.methods import METHODS
 
 MARKDOWN_FILE, CSV_FILE, JSON_FILE, FIGURE_FILE = (f"comparison.{kind}" for kind in ("md", "csv", "json", "png"))
-MEASURES = {"f_score": "F-score", "sample_success": "sample-success", "start_success": "from the start"}
+MOST = 1 << 40
+"""Of anything that is counted."""
 AVERAGED = ("best_f", "bce", "auc", "base_rate", "mean_tries")
 """Figures that do not follow from counts: their means over runs."""
 
-_COLUMNS = (
+COLUMNS = (
     *("method", "tries", "F-score", "paper", "sample-success", "paper", "from the start"),
     *("gap closed", "best F", "BCE", "AUC"),
 )
+"""Of the table that people see."""
 
-_Counts = tuple[Annotated[int, Field(ge=0, le=1 << 40)], ...]
 _COUNTED = tuple(field.name for field in fields(ObjectCounts) if field.name != "object")
-
-
-class _Columns(BaseModel):
-    """`learner.evaluation.ObjectCounts` as it was written."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    object: tuple[Annotated[str, Field(max_length=200)], ...]
-    queries: _Counts
-    true: _Counts
-    claimed: _Counts
-    hits: _Counts
-    trials: _Counts
-    successes: _Counts
-    start_trials: _Counts
-    start_successes: _Counts
-
-    @model_validator(mode="after")
-    def _of_the_same_objects(self) -> "_Columns":
-        if len({len(getattr(self, name)) for name in ("object", *_COUNTED)}) > 1:
-            raise ValueError("columns of different lengths; evaluate again")
-        return self
 
 
 class _Row(BaseModel):
@@ -74,7 +53,16 @@ class _Row(BaseModel):
     auc: float | None
     base_rate: float | None
     mean_tries: float | None
-    counts: _Columns
+    counts: ObjectCounts
+
+    @model_validator(mode="after")
+    def _whole(self) -> "_Row":
+        columns = [getattr(self.counts, name) for name in _COUNTED]
+        if any(len(column) != len(self.counts.object) for column in columns):
+            raise ValueError("counts of different lengths; evaluate again")
+        if any(not 0 <= number <= MOST for column in columns for number in column):
+            raise ValueError(f"counts that are not between 0 and {MOST}; evaluate again")
+        return self
 
 
 class _Results(BaseModel):
@@ -190,7 +178,7 @@ def _place(key: tuple[str, int]) -> tuple[int, str, int]:
 
 def _pooled(method: str, budget: int, results: Sequence[_Results]) -> PooledRow:
     rows = [next(row for row in each.rows if (row.method, row.budget) == (method, budget)) for each in results]
-    counts = [ObjectCounts(**dict(row.counts)) for row in rows]
+    counts = [row.counts for row in rows]
     together = _together([_by_content(each, contents.contents) for each, contents in zip(counts, results, strict=True)])
     averages = {}
     for name in AVERAGED:
@@ -258,8 +246,8 @@ def as_markdown(comparison: Comparison) -> str:
         "and the oracle, which is told the hidden facts. The paper's figures are of other objects and another "
         "simulator: orders and trends can be compared.",
         "",
-        f"| {' | '.join(_COLUMNS)} |",
-        "| --- |" + " ---: |" * (len(_COLUMNS) - 1),
+        f"| {' | '.join(COLUMNS)} |",
+        "| --- |" + " ---: |" * (len(COLUMNS) - 1),
     ]
     for row in comparison.rows:
         told = paper.get(row.method)

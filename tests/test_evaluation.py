@@ -80,7 +80,7 @@ def table_of(**values: object) -> Table:
 
 def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     shown = as_markdown(table_of())
-    assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | - | 40.0 [20.0, 60.0] | 0 |" in shown
+    assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | 40.0 [20.0, 60.0] | - | 0 |" in shown
     assert "30.0% succeed" in shown
     read = list(csv.DictReader(io.StringIO(as_csv(table_of().rows))))
     assert (read[0]["f_score"], read[0]["auc"]) == ("0.5", "")

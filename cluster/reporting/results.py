@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from pydantic import BaseModel, ConfigDict, Field
 
+from cluster.evaluation_tables import MEASURES, Measure
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
 from cluster.reporting.published import published
 from cluster.reporting.style import COLOURS, SOFT, laid_out
@@ -17,13 +17,6 @@ from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
 from shared.configuration import parse
 from shared.methods import METHODS
 
-Measure = Literal["f_score", "sample_success", "start_success"]
-MEASURES: tuple[tuple[Measure, str], ...] = (
-    ("f_score", "F-score"),
-    ("sample_success", "sample-success"),
-    ("start_success", "from the start"),
-)
-"""What is compared, and what people call it; in percent on the page. The paper has no figures of the last."""
 WITHOUT_TRIES = (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD)
 BEST_METHOD = "ours-final"
 
@@ -187,8 +180,8 @@ def tiles(results: Results) -> tuple[Tile, ...]:
 
 def table_of(results: Results, caption: str = "") -> Table:
     """Methods by budgets, beside the paper's."""
-    columns = [(measure, budget) for measure, _ in MEASURES for budget in results.budgets]
-    beside = {measure for measure, _ in MEASURES if results.has_paper and measure != "start_success"}
+    columns = [(measure, budget) for measure in MEASURES for budget in results.budgets]
+    beside = {measure for measure in MEASURES if results.has_paper and measure != "start_success"}
     second: Row = (Cell("tries", kind="name"),)
     for measure, budget in columns:
         second += (Cell(str(budget)), *([Cell("paper", kind="paper")] if measure in beside else []))
@@ -202,7 +195,7 @@ def table_of(results: Results, caption: str = "") -> Table:
                 paper = results.of_paper(method, budget, measure)
                 cells += (Cell("" if paper is None else f"{paper:.1f}", kind="paper"),)
         body.append(cells)
-    spans = [(name, (2 if measure in beside else 1) * len(results.budgets)) for measure, name in MEASURES]
+    spans = [(name, (2 if measure in beside else 1) * len(results.budgets)) for measure, name in MEASURES.items()]
     first: Row = (Cell("method", kind="name"), *(Cell(name, span=span) for name, span in spans))
     return Table((first, second), tuple(body), caption)
 
@@ -226,9 +219,9 @@ def _cell(row: ResultRow | None, measure: Measure, best: float | None) -> Cell:
 
 
 def _curves(results: Results) -> Drawing:
-    titles = [f"{name} (%)" for _, name in MEASURES]
+    titles = [f"{name} (%)" for name in MEASURES.values()]
     figure = make_subplots(1, len(MEASURES), subplot_titles=titles, horizontal_spacing=0.06)
-    for column, (measure, _) in enumerate(MEASURES, start=1):
+    for column, measure in enumerate(MEASURES, start=1):
         for method in results.methods:
             curve = _level(results, method, measure) if method in WITHOUT_TRIES else _curve(results, method, measure)
             if curve is not None:
