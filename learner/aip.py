@@ -135,7 +135,7 @@ class AipStage:
 
     def _order(self, rollouts: list[int], rng: np.random.Generator) -> OrderedRows:
         repeated = [number for number in rollouts for _ in range(self.config.draws)]
-        return order_rows(self.dataset, repeated, self.config.rows_per_rollout, rng)
+        return order_rows(self.dataset, repeated, self.config.rows_per_rollout, rng, self.config.continued_first)
 
     def _loss(self, predicted: Tensor, gains: Tensor, mask: Tensor) -> Tensor:
         return (mean_information_loss if self._inherits else information_loss)(predicted, gains, mask)

@@ -126,6 +126,8 @@ class AipConfig(TrainingConfig):
     """Tries of an ordered subset; each gives one target."""
     draws: int = Field(4, ge=1)
     """Ordered subsets a rollout and step, which share the encoded clouds."""
+    continued_first: float = Field(0.5, ge=0, le=1)
+    """As for AAP: what a try tells depends on where those before it left the object."""
     top: int = Field(5, ge=1)
     affordance: AffordanceConfig = AffordanceConfig(context=4)
 
