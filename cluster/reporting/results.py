@@ -214,7 +214,7 @@ def _cell(row: ResultRow | None, measure: Measure, best: float | None) -> Cell:
     if row is None or (value := row.value(measure)) is None:
         return Cell("")
     interval = row.interval(measure)
-    note = "" if interval is None else f"{100 * interval[0]:.0f} to {100 * interval[1]:.0f}"
+    note = "" if interval is None else f"{100 * interval[0]:.0f}\u2013{100 * interval[1]:.0f}"
     return Cell(f"{100 * value:.1f}", note, "best" if value == best and value > 0 else "")
 
 
@@ -233,7 +233,7 @@ def _curves(results: Results) -> Drawing:
             figure.add_trace(_paper_curve(paper).update(showlegend=column == 1), 1, column)
     figure.update_xaxes(title_text="tries", tickmode="array", tickvals=[0, *results.budgets], range=[-0.3, None])
     figure.update_yaxes(rangemode="tozero")
-    laid_out(figure, 430, legend={"orientation": "h", "y": -0.2, "x": 0.5, "xanchor": "center"})
+    laid_out(figure, 460, legend={"orientation": "h", "y": -0.3, "x": 0.5, "xanchor": "center"})
     return Drawing(
         figure,
         "What tries teach. Level lines: what tries nothing, and the oracle. Bars: 95% intervals over objects. Click a "
