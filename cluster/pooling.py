@@ -235,11 +235,12 @@ def as_markdown(comparison: Comparison) -> str:
     """The pooled table beside the paper's figures, and the table run by run."""
     paper = {str(name): each for name, each in published(comparison.task, novel_categories=False).items()}
     seeds = ", ".join(map(str, comparison.seeds))
+    runs = f"runs (seeds {seeds})" if len(comparison.seeds) > 1 else f"run (seed {seeds})"
     lines = [
         f"# {comparison.task}: all methods",
         "",
         f"{comparison.rollouts} trials on {comparison.objects} objects that no training saw, {len(comparison.seeds)} "
-        f"runs (seeds {seeds}). In percent; in brackets 95% bootstrap intervals over objects, all runs together. "
+        f"{runs}. In percent; in brackets 95% bootstrap intervals over objects, all runs together. "
         "F-score of the critic at threshold 0.5 on random interactions, of which "
         f"{_percent(comparison.base_rate)}% succeed. Sample-success: of the chosen action where the tries left the "
         "object, as in the paper; from the start: where they began. Gap closed: of that in F-score between Where2Act "
@@ -265,13 +266,13 @@ def as_markdown(comparison: Comparison) -> str:
             _number(row.averages["auc"]),
         ]
         lines.append("| " + " | ".join(cells) + " |")
-    runs = [f"seed {seed}" for seed in comparison.seeds]
+    columns = [f"seed {seed}" for seed in comparison.seeds]
     lines += [
         "",
         "Run by run (F-score / sample-success / from the start):",
         "",
-        "| method | tries | " + " | ".join(runs) + " |",
-        "| --- | ---: |" + " ---: |" * len(runs),
+        "| method | tries | " + " | ".join(columns) + " |",
+        "| --- | ---: |" + " ---: |" * len(columns),
     ]
     for row in comparison.rows:
         each = zip(*(row.by_run[name] for name in MEASURES), strict=True)
