@@ -234,13 +234,12 @@ def write_comparison(out: Path, comparison: Comparison) -> None:
 def as_markdown(comparison: Comparison) -> str:
     """The pooled table beside the paper's figures, and the table run by run."""
     paper = {str(name): each for name, each in published(comparison.task, novel_categories=False).items()}
-    seeds = ", ".join(map(str, comparison.seeds))
-    runs = f"runs (seeds {seeds})" if len(comparison.seeds) > 1 else f"run (seed {seeds})"
+    runs = "run (seed" if len(comparison.seeds) == 1 else "runs (seeds"
     lines = [
         f"# {comparison.task}: all methods",
         "",
         f"{comparison.rollouts} trials on {comparison.objects} objects that no training saw, {len(comparison.seeds)} "
-        f"{runs}. In percent; in brackets 95% bootstrap intervals over objects, all runs together. "
+        f"{runs} {_seeds(comparison)}). In percent; in brackets 95% bootstrap intervals over objects, all together. "
         "F-score of the critic at threshold 0.5 on random interactions, of which "
         f"{_percent(comparison.base_rate)}% succeed. Sample-success: of the chosen action where the tries left the "
         "object, as in the paper; from the start: where they began. Gap closed: of that in F-score between Where2Act "
@@ -306,10 +305,13 @@ def draw_comparison(comparison: Comparison, path: Path) -> None:
         axes.set_xticks(sorted({row.budget for row in comparison.rows if row.budget}))
         axes.grid(alpha=0.3)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
-    figure.suptitle(
-        f"{comparison.task}: {comparison.objects} unseen objects, {len(comparison.seeds)} runs", fontsize=10
-    )
+    title = f"{comparison.task}: {comparison.objects} unseen objects, seed {_seeds(comparison)}"
+    figure.suptitle(title, fontsize=10)
     figure.savefig(path, format="png")
+
+
+def _seeds(comparison: Comparison) -> str:
+    return ", ".join(map(str, comparison.seeds))
 
 
 def _interval(share: tuple[float, float, float]) -> str:
