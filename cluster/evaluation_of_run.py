@@ -2,11 +2,13 @@
 
 import hashlib
 import sys
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
+from cluster.adoption import seen_by
 from cluster.configuration import CampaignConfig
 from cluster.evaluation import Evaluation
 from cluster.evaluation_settings import EvaluateSettings
@@ -35,7 +37,7 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
     version = _version(run, policies, settings.policy)
     policy = Policy.from_files(policies.read_policy(version))
     task = _task(config, settings.task)
-    refs, folder = _objects(task, settings, used)
+    refs, folder = _objects(task, settings, used, seen_by(str(run.path)))
     setting = Setting(
         kind="evaluation",
         task=task.name,
@@ -100,8 +102,16 @@ def _task(config: CampaignConfig, name: str | None) -> Task:
     return task
 
 
-def _objects(task: Task, settings: EvaluateSettings, used: ObjectsUsed) -> tuple[tuple[ObjectRef, ...], Path]:
+def _objects(
+    task: Task, settings: EvaluateSettings, used: ObjectsUsed, seen: Collection[str]
+) -> tuple[tuple[ObjectRef, ...], Path]:
     """The run's test objects, or all of another folder that suit the task and were not trained on; and their folder.
+
+    Args:
+        task: what is evaluated.
+        settings: may name another folder.
+        used: by the run.
+        seen: content hashes of what was trained on, by the run or by the policy that it started from.
 
     Raises:
         UsageError: none is left.
@@ -114,8 +124,7 @@ def _objects(task: Task, settings: EvaluateSettings, used: ObjectsUsed) -> tuple
         refs &= set(used.test)
     else:
         # By content: the same object may lie in two folders, under two names.
-        trained = {ref.content_hash for ref in (*used.train, *used.validation)}
-        refs = {ref for ref in refs if ref.content_hash not in trained}
+        refs = {ref for ref in refs if ref.content_hash not in seen}
     if not refs:
         raise UsageError(f"{folder}: no object suits task '{task.name}' and was not trained on; name other objects")
     return tuple(sorted(refs, key=lambda ref: ref.id)), folder

@@ -10,10 +10,13 @@ from cluster.campaign import Campaign, Crew
 from cluster.cli import run as adaafford
 from cluster.configuration import CampaignConfig
 from cluster.estimate import estimate
+from cluster.evaluation_of_run import evaluate_run
+from cluster.evaluation_settings import EvaluateSettings
 from cluster.run_folder import RunFolder
 from cluster.training import as_toml
 from learner.stages import read_policy_folder
 from shared.plan import ObjectRef
+from shared.store import Store
 from tests.finished_run import make_finished_run
 from tests.test_learner_training import FAST
 
@@ -38,6 +41,21 @@ def test_what_is_adopted_remembers_what_it_has_seen(source: RunFolder, tmp_path:
     seen = set(json.loads((tmp_path / "done.json").read_text())["objects"])
     assert seen == {ref.content_hash for ref in source.objects_used().train} == seen_by(str(source.path))
     assert read_policy_folder(tmp_path).trained >= {"prior", "aap", "aip"}
+
+
+def test_a_run_that_started_from_a_policy_is_not_evaluated_on_what_that_has_seen(
+    source: RunFolder, tmp_path: Path
+) -> None:
+    made = make_finished_run(tmp_path / "run", objects=2)  # Of the same objects, and trained on fewer.
+    adopt(str(source.path), "push-faucet", made.adopted)
+    used = made.objects_used()
+    own = {ref.content_hash for ref in used.train}
+    assert seen_by(str(made.path)) == own | seen_by(str(source.path)) > own
+    told = EvaluateSettings(objects=Path(source.objects_used().folder), methods=("where2act",), trials=1, queries=1)
+    evaluate_run(made.path, told.model_copy(update={"workers": 0}), tmp_path / "out")
+    tested = {ref.content_hash for ref in Store.open(tmp_path / "out" / "store").setting.objects}
+    assert tested
+    assert not tested & (own | seen_by(str(source.path)))
 
 
 @pytest.mark.parametrize(
