@@ -88,11 +88,11 @@ class Campaign:
 
     def stages(self, crew: Crew) -> list[Stage]:
         """All stages, in order."""
-        trainer, adopted = self._trainer, self._config.start_from is not None
+        trainer = self._trainer
         stages = [
             Stage("objects", self._choose_objects),
             Stage("collect-random", partial(self._collect, crew, "random", 0, self._config.rollouts.random)),
-            Stage("adopt", trainer.adopt) if adopted else Stage("train-prior", trainer.prior),
+            Stage("adopt", trainer.adopt) if trainer.adopts else Stage("train-prior", trainer.prior),
         ]
         final = self._config.alternations + 1
         for version in range(1, final + 1):
@@ -101,8 +101,8 @@ class Campaign:
                 stages.append(
                     Stage(f"collect-aip-{version - 1}", partial(self._collect, crew, "aip", version - 1, count))
                 )
-            last = "adopted" if adopted and version == 1 else f"aip-{version}"
-            if last != "adopted":
+            last = trainer.left_by(version)
+            if version > 1 or not trainer.adopts:
                 stages += [
                     Stage(f"train-aap-{version}", partial(trainer.aap, version)),
                     Stage(f"train-aip-{version}", partial(trainer.aip, version)),

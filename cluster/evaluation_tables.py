@@ -7,12 +7,15 @@ again leaves the same bytes.
 import csv
 import io
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
 from shared.files import write_atomically
+from shared.methods import METHODS, MethodName
 
 RESULTS_FILE, CSV_FILE, MARKDOWN_FILE = "results.json", "table.csv", "table.md"
 
@@ -37,6 +40,10 @@ _SHOWN: Mapping[str, str] = {
 """Columns that people see, and what they call them."""
 _PERCENT = frozenset({*MEASURES, "gap_closed", "best_f"})
 _ONLY_FOR_PROGRAMS = frozenset({"counts"})
+BEST_METHOD: MethodName = "ours-final"
+WITHOUT_TRIES = (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD)
+ORDER = (*METHODS, NO_TRIES_METHOD, ORACLE_METHOD)
+"""Of rows: as in the paper's tables, and then what stands beside them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +70,11 @@ class Table:
     store_digest: str
     contents: Mapping[str, str]
     rows: tuple[Mapping[str, Any], ...]
+
+
+def share_of_gap(low: float, value: float, high: float) -> float:
+    """How far a value is from the one to the other; NaN where there is no way to go."""
+    return (value - low) / (high - low) if high > low else math.nan
 
 
 def write_tables(out: Path, table: Table) -> None:

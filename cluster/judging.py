@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from cluster.evaluation_tables import Table, write_tables
+from cluster.evaluation_tables import Table, share_of_gap, write_tables
 from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD, EvaluationRow, evaluate_store
 from learner.oracle import read_oracle
 from learner.recipes import ORACLE_FILE
@@ -62,8 +62,7 @@ def judge(store: Store, version: int, oracle: Path) -> Table:
 def _gap_closed(row: EvaluationRow, rows: list[EvaluationRow]) -> float:
     """The share of the gap in F-score between Where2Act and the oracle that a method closes; NaN without such a gap."""
     prior, oracle = (next((r.f_score for r in rows if r.method == m), math.nan) for m in (PRIOR_METHOD, ORACLE_METHOD))
-    gap = oracle - prior
-    return (row.f_score - prior) / gap if gap > 0 else math.nan
+    return share_of_gap(prior, row.f_score, oracle)
 
 
 def _plain(row: EvaluationRow) -> dict[str, Any]:

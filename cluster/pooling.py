@@ -17,16 +17,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cluster.evaluation_tables import MEASURES, RESULTS_FILE, as_csv
+from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, RESULTS_FILE, WITHOUT_TRIES, as_csv, share_of_gap
 from cluster.reporting.published import published
 from cluster.reporting.style import COLOURS, SOFT
 from cluster.run_folder import RunFolder, find, read_json
-from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD, ObjectCounts
+from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD, ObjectCounts
 from learner.training import without_nan
 from shared.configuration import parse
 from shared.errors import UsageError
 from shared.files import write_atomically
-from shared.methods import METHODS
 
 MARKDOWN_FILE, CSV_FILE, JSON_FILE, FIGURE_FILE = (f"comparison.{kind}" for kind in ("md", "csv", "json", "png"))
 MOST = 1 << 40
@@ -156,7 +155,7 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         rollouts=sum(each.rollouts for each in results),
         objects=len({content for each in results for content in each.contents.values()}),
         base_rate=rows[0].averages["base_rate"],
-        rows=tuple(replace(row, gap_closed=_part_of(prior, row.shares["f_score"][0], oracle)) for row in rows),
+        rows=tuple(replace(row, gap_closed=share_of_gap(prior, row.shares["f_score"][0], oracle)) for row in rows),
     )
 
 
@@ -170,10 +169,8 @@ def _read(run: RunFolder, evaluation: str | None) -> _Results:
 
 
 def _place(key: tuple[str, int]) -> tuple[int, str, int]:
-    """In the order of the paper's tables, and then what stands beside them."""
-    order = [*METHODS, NO_TRIES_METHOD, ORACLE_METHOD]
     method, budget = key
-    return order.index(method) if method in order else len(order), method, budget
+    return ORDER.index(method) if method in ORDER else len(ORDER), method, budget
 
 
 def _pooled(method: str, budget: int, results: Sequence[_Results]) -> PooledRow:
@@ -213,11 +210,6 @@ def _together(counts: Sequence[ObjectCounts]) -> ObjectCounts:
 
 def _share_of(rows: Sequence[PooledRow], method: str) -> float:
     return next((row.shares["f_score"][0] for row in rows if row.method == method), math.nan)
-
-
-def _part_of(low: float, value: float, high: float) -> float:
-    """How far a value is from the one to the other; NaN where there is no way to go."""
-    return (value - low) / (high - low) if high > low else math.nan
 
 
 def write_comparison(out: Path, comparison: Comparison) -> None:
@@ -292,10 +284,10 @@ def draw_comparison(comparison: Comparison, path: Path) -> None:
             rows = [row for row in comparison.rows if row.method == method]
             values = [100 * row.shares[measure][0] for row in rows]
             budgets = [row.budget for row in rows]
-            if method in (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD):
+            if method in WITHOUT_TRIES:
                 axes.axhline(values[0], color=colours[method], linestyle="--", linewidth=1.2, label=method)
                 continue
-            ours = method == "ours-final"
+            ours = method == BEST_METHOD
             axes.plot(budgets, values, "o-", color=colours[method], linewidth=3 if ours else 1.3, label=method)
             if ours:
                 low, high = ([100 * row.shares[measure][end] for row in rows] for end in (1, 2))

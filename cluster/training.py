@@ -40,14 +40,22 @@ class Trainer:
         self._config = config
         self._say = say
 
+    @property
+    def adopts(self) -> bool:
+        """Whether the run starts from a policy, which is its version 1."""
+        return self._config.start_from is not None
+
+    def left_by(self, version: int) -> str:
+        """The stage that leaves AAP and AIP of a version."""
+        return "adopted" if self.adopts and version == 1 else f"aip-{version}"
+
     def prior(self) -> Mapping[str, Any]:
         """The Where2Act prior, from the random round."""
         return self._train("prior", "prior", None)
 
     def aap(self, version: int) -> Mapping[str, Any]:
         """AAP: from the prior at first, then fine-tuned with what its own AIP chose to try."""
-        before = "adopted" if version == 2 and self._config.start_from is not None else f"aip-{version - 1}"
-        return self._train("aap", f"aap-{version}", "prior" if version == 1 else before)
+        return self._train("aap", f"aap-{version}", "prior" if version == 1 else self.left_by(version - 1))
 
     def adopt(self) -> Mapping[str, Any]:
         """The policy that the run starts from, in place of one trained from nothing."""

@@ -8,17 +8,13 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from pydantic import BaseModel, ConfigDict, Field
 
-from cluster.evaluation_tables import MEASURES, Measure
+from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, WITHOUT_TRIES, Measure
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
 from cluster.reporting.published import published
 from cluster.reporting.style import COLOURS, SOFT, laid_out
 from cluster.run_folder import read_json
-from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
+from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD
 from shared.configuration import parse
-from shared.methods import METHODS
-
-WITHOUT_TRIES = (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD)
-BEST_METHOD = "ours-final"
 
 
 class ResultRow(BaseModel):
@@ -88,9 +84,8 @@ class Results:
     @property
     def methods(self) -> list[str]:
         """In the order of the paper's table, and then what stands beside them."""
-        order = [*METHODS, NO_TRIES_METHOD, ORACLE_METHOD]
         found = {row.method for row in self.rows}
-        return [name for name in order if name in found] + sorted(found - set(order))
+        return [name for name in ORDER if name in found] + sorted(found - set(ORDER))
 
     @property
     def has_paper(self) -> bool:
