@@ -11,6 +11,7 @@ The same live workers serve every collection round; each round's policy reaches 
 
 import sys
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -77,7 +78,7 @@ class Campaign:
             AdaAffordError: a stage cannot go on; what was done stays done.
         """
         config = self._config
-        with only_driver(self._run.path):
+        with only_driver(self._run.path), closing(self._trainer):
             ledger = Ledger(self._run.log)
             ledger.note("attempt", workers=config.workers)
             with fleets(config.workers, config.limits, config.ray_address) as make_fleet:

@@ -6,6 +6,7 @@ Heavy packages are imported by the subcommands that need them, so that help is i
 import os
 import signal
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from typing import NoReturn
 
@@ -44,10 +45,15 @@ USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells 
 
 def main() -> NoReturn:
     """Run the command line of this process and exit."""
+    begin_process()
+    sys.exit(run(sys.argv[1:]))
+
+
+def begin_process() -> None:
+    """Set up logging and signals of a process of ours."""
     configure(os.environ)
     # As Ctrl-C does, so that workers and learners are ended in an orderly way.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    sys.exit(run(sys.argv[1:]))
 
 
 def run(args: list[str]) -> int:
@@ -60,13 +66,23 @@ def run(args: list[str]) -> int:
         name = "version"
     if name not in COMMANDS:
         return _complain(f"unknown command '{name}'; allowed: {', '.join(COMMANDS)}", 2)
+    return guarded(lambda: import_module(f"cluster.commands.{name.replace('-', '_')}").main(rest), args)
+
+
+def guarded(command: Callable[[], int], args: list[str]) -> int:
+    """Run a subcommand; what it raises becomes one line and an exit code.
+
+    Args:
+        command: returns its exit code.
+        args: the command line that it came from.
+    """
     try:
-        code: int = import_module(f"cluster.commands.{name.replace('-', '_')}").main(rest)
+        code = command()
         sys.stdout.flush()
     except AdaAffordError as error:
         return _complain(str(error), error.exit_code)
     except KeyboardInterrupt:
-        return _interrupted(name, args)
+        return _interrupted(args)
     except BrokenPipeError:
         # Whoever read our output has enough (`adaafford ... | head`); keep Python from complaining at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -74,9 +90,9 @@ def run(args: list[str]) -> int:
     return code
 
 
-def _interrupted(name: str, args: list[str]) -> int:
+def _interrupted(args: list[str]) -> int:
     """Say how to go on after Ctrl-C."""
-    hint = "; what is committed stays, and the same command goes on" if name in RESUMABLE else ""
+    hint = "; what is committed stays, and the same command goes on" if args[0] in RESUMABLE else ""
     print(
         f"adaafford: interrupted{hint}: adaafford {' '.join(args)}" if hint else "adaafford: interrupted",
         file=sys.stderr,

@@ -5,8 +5,8 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
+from cluster.children import THREADS
 from cluster.estimate import Estimate, Rates
-from cluster.training import THREADS
 
 
 def print_estimate(estimate: Estimate, workers: int, rates: Rates) -> None:

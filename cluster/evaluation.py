@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from cluster.children import run_child
 from cluster.collection import Collected, OpenFleet, collect
-from cluster.training import run_child
 from shared.errors import UsageError
 from shared.methods import METHODS, versions_of
 from shared.plan import EvaluationConfig, Plan

@@ -1,29 +1,20 @@
-"""Training stages as child processes: the learner shares a process with neither Ray nor SAPIEN."""
+"""The training stages of a run, and what each starts from."""
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cluster.adoption import adopt
+from cluster.children import THREADS, Learner
 from cluster.configuration import CampaignConfig
 from cluster.run_folder import RunFolder
 from learner.configuration import LearnerConfig
-from shared.errors import UsageError, WorkerError
 from shared.files import read_bounded, write_atomically
 from shared.methods import BaselineName
 from shared.plan import ObjectRef
 from shared.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
 from shared.store import Store
-
-THREADS = 2
-"""Of torch, in a learner: the collectors rest while it trains."""
-PATIENCE_S = 10.0
-"""How long a learner may take to end when asked to."""
-OUTPUT_FILE = "output.txt"
 
 
 class Trainer:
@@ -39,6 +30,7 @@ class Trainer:
         self._run = run
         self._config = config
         self._say = say
+        self._learner = Learner()
 
     @property
     def adopts(self) -> bool:
@@ -74,25 +66,31 @@ class Trainer:
 
     def publish(self, version: int, after: str) -> Mapping[str, Any]:
         """Put the policy that the stage `after` left into the store, where collectors find it."""
+        # They want its cores and its memory.
+        self.close()
         folder = self._run.training(after)
         files = {name: read_bounded(folder / name, MAX_WEIGHTS_BYTES) for name in (WEIGHTS_FILE, POLICY_FILE)}
         Store.open(self._run.store).publish_policy(version, files)
         self._say(f"published policy {version}, {sum(map(len, files.values())) / 1e6:.1f} MB")
         return {"policy": version}
 
+    def close(self) -> None:
+        """End the learner."""
+        self._learner.close()
+
     def _train(self, network: str, stage: str, init: str | None) -> dict[str, Any]:
         out = self._run.training(stage)
         out.mkdir(parents=True, exist_ok=True)
         used = self._run.objects_used()
         told = LearnerConfig(seed=self._config.seed, threads=THREADS, **dict(self._config.learner))
-        arguments = ["train", network, "--store", str(self._run.store), "--out", str(out)]
+        arguments = [network, "--store", str(self._run.store), "--out", str(out)]
         arguments += ["--config", _written(out / "learner.toml", as_toml(told.model_dump(mode="json")))]
         arguments += ["--train-objects", _written(out / "train.txt", _ids(used.train))]
         if used.validation:
             arguments += ["--validation-objects", _written(out / "validation.txt", _ids(used.validation))]
         if init is not None:
             arguments += ["--init", str(self._run.training(init))]
-        run_child("cluster", arguments, out, lambda line: self._say(f"  {line}"))
+        self._learner.train(arguments, out, lambda line: self._say(f"  {line}"))
         return {"policy_folder": str(out.relative_to(self._run.path))}
 
 
@@ -115,73 +113,3 @@ def _written(path: Path, text: str) -> str:
 
 def _ids(refs: Sequence[ObjectRef]) -> str:
     return "".join(f"{ref.id} {ref.category}\n" for ref in refs)
-
-
-def run_child(module: str, arguments: Sequence[str], out: Path, say: Callable[[str], None]) -> None:
-    """Run `python -m MODULE ARGUMENTS` and wait; it dies with this process, however that dies.
-
-    Args:
-        module: what to run.
-        arguments: its arguments.
-        out: folder that gets output.txt, everything that it printed.
-        say: is given each line as it comes.
-
-    Raises:
-        UsageError: it refused its input; its own line is the message.
-        WorkerError: it failed otherwise; the message names output.txt.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    wrapper = [sys.executable, "-m", "cluster.lifeline", str(os.getpid())]
-    command = [*wrapper, sys.executable, "-m", module, *arguments]
-    # A session of its own: Ctrl-C reaches this process alone, which then ends the learner in an orderly way.
-    with (out / OUTPUT_FILE).open("w", encoding="utf-8") as log:
-        child = subprocess.Popen(
-            command,
-            env=_environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            text=True,
-            errors="replace",
-        )
-        try:
-            last = _relay(child, log.write, say)
-        finally:
-            _end(child)
-    if child.returncode == UsageError.exit_code:
-        raise UsageError(last.removeprefix("adaafford: "))
-    if child.returncode != 0:
-        raise WorkerError(
-            f"`python -m {module} {' '.join(arguments)}` ended with code {child.returncode}; see {out / OUTPUT_FILE}"
-        )
-
-
-def _relay(child: "subprocess.Popen[str]", write: Callable[[str], object], say: Callable[[str], None]) -> str:
-    """Pass the child's lines on; returns the last one."""
-    last = ""
-    assert child.stdout is not None
-    for line in child.stdout:
-        write(line)
-        last = line.rstrip() or last
-        say(line.rstrip())
-    child.wait()
-    return last
-
-
-def _end(child: "subprocess.Popen[str]") -> None:
-    """End the child if it still runs: politely, then not."""
-    if child.poll() is None:
-        child.terminate()
-        try:
-            child.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-    if child.stdout is not None:
-        child.stdout.close()
-
-
-def _environment() -> dict[str, str]:
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(THREADS))
-    return {**os.environ, **threads, "PYTHONUNBUFFERED": "1"}

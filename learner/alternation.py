@@ -18,7 +18,7 @@ from learner import sharing
 from learner.configuration import AlternationConfig, LearnerConfig
 from learner.hardware import Hardware
 from learner.recipes import ORACLE_FILE
-from learner.stages import DONE_FILE, MAX_DONE_BYTES, StageJob, StageName, run_stage
+from learner.stages import DONE_FILE, MAX_DONE_BYTES, Memory, StageJob, StageName, run_stage
 from shared.errors import StoreError, UsageError
 from shared.files import read_bounded, write_atomically
 from shared.policy import Policy
@@ -94,16 +94,16 @@ def alternate(
         UsageError: see `run_stage`.
         StoreError: see `run_stage`.
     """
-    hardware = hardware or Hardware()
+    hardware, memory = hardware or Hardware(), Memory()
     rounds = rounds or Finished(Store.open(job.store))
-    last = _run(rounds.data(job, 0), config, hardware, "prior", "prior", job.init)
+    last = _run(rounds.data(job, 0), config, hardware, memory, "prior", "prior", job.init)
     trained: list[Round] = []
     policies: list[Policy] = []
     while not converged([found.score for found in trained], config.alternation, rounds.at_least):
         number = len(trained) + 1
         seen = rounds.data(job, number)
-        aap = _run(seen, config, hardware, "aap", f"aap-{number}", last[0])
-        last = _run(seen, config, hardware, "aip", f"aip-{number}", aap[0])
+        aap = _run(seen, config, hardware, memory, "aap", f"aap-{number}", last[0])
+        last = _run(seen, config, hardware, memory, "aip", f"aip-{number}", aap[0])
         policies.append(last[1])
         trained.append(Round(number, best_score(aap[0])))
         rounds.done(number, last[0])
@@ -189,7 +189,13 @@ def best_score(folder: Path) -> float:
 
 
 def _run(
-    job: StageJob, config: LearnerConfig, hardware: Hardware, stage: StageName, folder: str, init: Path | None
+    job: StageJob,
+    config: LearnerConfig,
+    hardware: Hardware,
+    memory: Memory,
+    stage: StageName,
+    folder: str,
+    init: Path | None,
 ) -> tuple[Path, Policy]:
     out = job.out / folder
-    return out, run_stage(replace(job, stage=stage, out=out, init=init), config, hardware)
+    return out, run_stage(replace(job, stage=stage, out=out, init=init), config, hardware, memory)

@@ -18,13 +18,15 @@ ENCODING_CHUNK = 16
 """Clouds encoded at once; bounds memory."""
 POOL_POINTS = 16
 """Movable points of each cloud that proposals are drawn at."""
+MOST_ENCODERS = 3
+"""Whose features are remembered: the prior's, AAP's, and one that comes or goes; each takes some KB a row."""
 
 
 class FrozenFeatures:
     """Features of a data set's rows, and of a pool of movable points, under whatever encoder is not trained just now.
 
     Encoders of equal weights share them: AAP keeps its oracle's encoder, and AIP AAP's, and most of the time that a
-    stage takes beside its steps goes to encoding.
+    stage takes beside its steps goes to encoding. What was asked for longest ago is forgotten first.
 
     Attributes:
         dataset: the interactions.
@@ -55,14 +57,19 @@ class FrozenFeatures:
 
     def _under(self, encoder: PointNet2) -> tuple[Tensor, Tensor]:
         digest = _weights_digest(encoder)
-        if digest not in self._known:
-            rows = self.dataset.rows
-            owner = torch.arange(len(self.point)).repeat_interleave(self.point.shape[1])
-            cloud, point = torch.cat([rows.cloud, owner]), torch.cat([rows.point, self.point.flatten()])
-            found = frozen_features(encoder, self.dataset.clouds, cloud, point)
-            of_pool = found[len(rows.cloud) :].reshape(*self.point.shape, encoder.width)
-            self._known[digest] = found[: len(rows.cloud)], of_pool
-        return self._known[digest]
+        found = self._known.pop(digest, None) or self._encoded(encoder)
+        while len(self._known) >= MOST_ENCODERS:
+            del self._known[next(iter(self._known))]
+        self._known[digest] = found
+        return found
+
+    def _encoded(self, encoder: PointNet2) -> tuple[Tensor, Tensor]:
+        rows = self.dataset.rows
+        owner = torch.arange(len(self.point)).repeat_interleave(self.point.shape[1])
+        cloud, point = torch.cat([rows.cloud, owner]), torch.cat([rows.point, self.point.flatten()])
+        found = frozen_features(encoder, self.dataset.clouds, cloud, point)
+        of_pool = found[len(rows.cloud) :].reshape(*self.point.shape, encoder.width)
+        return found[: len(rows.cloud)], of_pool
 
 
 @dataclass(frozen=True, slots=True)

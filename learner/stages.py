@@ -33,6 +33,7 @@ from learner.training import CHECKPOINT_FILE, TrainingResult, without_nan
 from shared.errors import StoreError, UsageError
 from shared.files import exclusive_lock, read_bounded, write_atomically
 from shared.methods import ModuleName
+from shared.networks.configuration import NetworkConfig
 from shared.policy import (
     MAX_POLICY_JSON_BYTES,
     MAX_WEIGHTS_BYTES,
@@ -88,8 +89,44 @@ class StageJob:
     newest_policy: int | None = None
 
 
-def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = None) -> Policy:
+class Memory:
+    """What the stages of one process share: the interactions that the last one learnt from, and features of them.
+
+    The next stage mostly learns from the same, under encoders that the last one used; to read and encode them anew
+    would take three quarters of its time.
+    """
+
+    def __init__(self) -> None:
+        self._known: FrozenFeatures | None = None
+        self._key: tuple[object, ...] = ()
+
+    def features(self, store: Store, network: NetworkConfig, seed: int, hardware: Hardware) -> FrozenFeatures:
+        """All interactions of a store, with a pool of points drawn by a seed.
+
+        Raises:
+            StoreError: the store is damaged, or holds no label at all.
+        """
+        key = store.digest(), network, seed, hardware
+        if self._known is None or key != self._key:
+            # Two data sets at once may be more than there is room for.
+            self._known = None
+            dataset = load_dataset(store, network).on(hardware.device)
+            with hardware.home():
+                self._known = FrozenFeatures.with_pool(dataset, generator(seed, "learner.pool"))
+            self._key = key
+        return self._known
+
+
+def run_stage(
+    job: StageJob, config: LearnerConfig, hardware: Hardware | None = None, memory: Memory | None = None
+) -> Policy:
     """Run a stage, go on with it after a kill, or return what it made where it is done; the policy is on the CPU.
+
+    Args:
+        job: what on.
+        config: the settings.
+        hardware: what to train on; the CPU where none is given.
+        memory: of the stages that this process ran before; what they made does not depend on it.
 
     Raises:
         UsageError: the store or the policy is missing or of another task, objects leak between the parts, or `out`
@@ -114,7 +151,7 @@ def run_stage(job: StageJob, config: LearnerConfig, hardware: Hardware | None = 
     except OSError as error:
         raise UsageError(f"--out {job.out}: cannot be made ({error.strerror}); choose another folder") from None
     with exclusive_lock(job.out / LOCK_FILE) if sharing.rank() == 0 else nullcontext():
-        _train(job, config, store, policy, oracle, fingerprint, hardware or Hardware())
+        _train(job, config, store, policy, oracle, fingerprint, hardware or Hardware(), memory or Memory())
     _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
     return policy
 
@@ -127,10 +164,12 @@ def _train(
     oracle: Path | None,
     fingerprint: str,
     hardware: Hardware,
+    memory: Memory,
 ) -> None:
     """Train the policy, and leave it in the stage's folder, which no other learner writes meanwhile."""
     _check_checkpoints(job.out, fingerprint)
-    dataset = load_dataset(store, policy.config)
+    known = memory.features(store, policy.config, config.seed, hardware)
+    dataset = known.dataset
     parts = split(dataset, job.train_objects, job.validation_objects)
     if job.newest_policy is not None:
         parts = without_later(dataset, parts, job.newest_policy)
@@ -144,7 +183,6 @@ def _train(
     with hardware.home():
         runner = Runner(job.out, config.seed, fingerprint, hardware)
         told = None if oracle is None else read_oracle(oracle, policy.config).to(hardware.device)
-        known = FrozenFeatures.with_pool(dataset.on(hardware.device), generator(config.seed, "learner.pool"))
         result = Recipe(config, policy, known, parts, runner, told).train(job.stage)
     policy.modules().to("cpu")
     policy.with_trained(job.stage)

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster import training
+from cluster import children, training
 from shared.errors import UsageError, WorkerError
 
 STAND_IN = "learner_stand_in"
@@ -46,19 +46,19 @@ def learner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_its_lines_are_passed_on_and_kept(learner: Path, tmp_path: Path) -> None:
     lines: list[str] = []
-    training.run_child(STAND_IN, ["work"], tmp_path / "out", lines.append)
-    assert lines == ["step 1", str(training.THREADS)]
-    assert (tmp_path / "out" / training.OUTPUT_FILE).read_text().splitlines() == lines
+    children.run_child(STAND_IN, ["work"], tmp_path / "out", lines.append)
+    assert lines == ["step 1", str(children.THREADS)]
+    assert (tmp_path / "out" / children.OUTPUT_FILE).read_text().splitlines() == lines
 
 
 def test_what_it_refuses_is_refused_in_its_words(learner: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"^setting 'steps': too few$"):
-        training.run_child(STAND_IN, ["refuse"], tmp_path, lambda line: None)
+        children.run_child(STAND_IN, ["refuse"], tmp_path, lambda line: None)
 
 
 def test_a_crash_names_its_output(learner: Path, tmp_path: Path) -> None:
     with pytest.raises(WorkerError, match=r"ended with code 7; see .*output\.txt$"):
-        training.run_child(STAND_IN, ["crash"], tmp_path, lambda line: None)
+        children.run_child(STAND_IN, ["crash"], tmp_path, lambda line: None)
 
 
 def test_an_interrupt_ends_it(learner: Path, tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_an_interrupt_ends_it(learner: Path, tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        training.run_child(STAND_IN, ["hang"], tmp_path, interrupt)
+        children.run_child(STAND_IN, ["hang"], tmp_path, interrupt)
     assert not [child for child in psutil.Process().children() if STAND_IN in " ".join(child.cmdline())]
 
 
@@ -75,8 +75,8 @@ def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> 
         [
             sys.executable,
             "-uc",
-            "import pathlib; from cluster import training;"
-            f"training.run_child({STAND_IN!r}, ['hang'], pathlib.Path({str(tmp_path)!r}), print)",
+            "import pathlib; from cluster import children;"
+            f"children.run_child({STAND_IN!r}, ['hang'], pathlib.Path({str(tmp_path)!r}), print)",
         ],
         stdout=subprocess.PIPE,
     )

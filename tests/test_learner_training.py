@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from cluster.cli import run
+from learner import features, stages
 from learner.aap import AapStage, OracleStage, SeenRows, predict
 from learner.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic
 from learner.aip import AipStage
@@ -21,14 +22,14 @@ from learner.configuration import AapConfig, AffordanceConfig, AipConfig, Learne
 from learner.curve import Answers, Asked, Candidates, answer, proposal_gains, tries_by_aip
 from learner.data import Dataset, Split, load_dataset
 from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
-from learner.features import FrozenFeatures, ProposalPool
+from learner.features import MOST_ENCODERS, FrozenFeatures, ProposalPool, frozen_features
 from learner.frozen import FrozenAap
 from learner.information import tries_by_information
 from learner.names import METRICS_FILE
 from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
 from learner.sampling import Batch, order_rows
-from learner.stages import DONE_FILE, StageJob, read_policy_folder, run_stage
+from learner.stages import DONE_FILE, Memory, StageJob, read_policy_folder, run_stage
 from learner.training import Stage, StepResult, rate_factor, train
 from shared.errors import UsageError
 from shared.networks.configuration import NetworkConfig
@@ -425,6 +426,38 @@ def test_a_finished_stage_is_not_run_again(trained: Path) -> None:
     assert (trained / "prior" / WEIGHTS_FILE).stat().st_mtime_ns == stamp
     with pytest.raises(UsageError, match="other data or settings"):
         run_stage(StageJob("prior", trained / "store", trained / "prior"), FAST.model_copy(update={"seed": 1}))
+
+
+def test_stages_of_one_process_make_the_same_and_read_and_encode_once(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loads, encoded, memory = [], [], Memory()
+    monkeypatch.setattr(stages, "load_dataset", lambda *told: loads.append(told) or load_dataset(*told))
+    monkeypatch.setattr(features, "frozen_features", lambda *told: encoded.append(told) or frozen_features(*told))
+    privileged = FAST.model_copy(update={"aap": FAST.aap.model_copy(update={"training": "privileged"})})
+    before: Path | None = None
+    for stage, config in (("prior", FAST), ("aap", privileged), ("aip", FAST)):
+        run_stage(StageJob(stage, trained / "store", tmp_path / stage, before), config, None, memory)
+        before = tmp_path / stage
+        assert (before / WEIGHTS_FILE).read_bytes() == (trained / stage / WEIGHTS_FILE).read_bytes()
+    assert len(loads) == 1
+    assert len(encoded) == 2, "the prior's encoder and AAP's, which is the oracle's"
+    run_stage(
+        StageJob("prior", trained / "store", tmp_path / "other"), FAST.model_copy(update={"seed": 1}), None, memory
+    )
+    assert len(loads) == 2, "another seed draws another pool"
+
+
+def test_features_of_the_encoders_asked_for_last_are_remembered(dataset: Dataset) -> None:
+    known = FrozenFeatures(dataset)
+    encoders = [Policy.untrained("push", TINY, seed).prior.encoder.eval() for seed in range(MOST_ENCODERS + 1)]
+    found = [known.rows(encoder) for encoder in encoders[:-1]]
+    assert known.rows(encoders[0]) is found[0]
+    known.rows(encoders[-1])
+    assert known.rows(encoders[0]) is found[0], "asked for just before"
+    again = known.rows(encoders[1])
+    assert again is not found[1]
+    assert torch.equal(again, found[1])
 
 
 def test_a_checkpoint_of_another_run_is_refused(trained: Path, tmp_path: Path) -> None:

@@ -8,8 +8,10 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
 from hypothesis import given
@@ -17,6 +19,7 @@ from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from cluster.children import OUTPUT_FILE, Learner
 from cluster.cli import INTERRUPTED, run
 from cluster.training import as_toml
 from learner.alternation import ALTERNATION_FILE, alternate, converged
@@ -25,9 +28,9 @@ from learner.data import load_dataset, split, without_later
 from learner.hardware import Hardware
 from learner.names import METRICS_FILE
 from learner.progress import ProgressReport, Standing
-from learner.stages import DONE_FILE, LOCK_FILE, StageJob, run_stage
+from learner.stages import DONE_FILE, LOCK_FILE, StageJob, read_policy_folder, run_stage
 from learner.training import CHECKPOINT_FILE
-from shared.errors import UsageError
+from shared.errors import UsageError, WorkerError
 from shared.files import exclusive_lock
 from shared.plan import Job
 from shared.policy import POLICY_FILE, WEIGHTS_FILE
@@ -93,6 +96,42 @@ def test_it_trains_without_ray_and_sapien(store: Path, config_file: Path, tmp_pa
     assert (err, out.splitlines()[0]) == ("", "device: cpu (1 thread)")
     assert f"leaves {WEIGHTS_FILE}, {POLICY_FILE} and {METRICS_FILE} in {tmp_path / 'out'}" in out
     assert (tmp_path / "out" / WEIGHTS_FILE).is_file()
+
+
+def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, config_file: Path, tmp_path: Path) -> None:
+    def arguments(stage: str, *init: str) -> list[str]:
+        return [stage, "--store", str(store), "--out", str(tmp_path / stage), "--config", str(config_file), *init]
+
+    lines: list[str] = []
+    with closing(Learner()) as learner:
+        learner.train(arguments("prior"), tmp_path / "prior", lines.append)
+        one = psutil.Process().children()
+        learner.train(arguments("aap", "--init", str(tmp_path / "prior")), tmp_path / "aap", lines.append)
+        assert psutil.Process().children() == one, "the same process"
+        with pytest.raises(UsageError, match="'aip' starts from a policy: add --init"):
+            learner.train(arguments("aip"), tmp_path / "aip", lines.append)
+        assert not one[0].is_running(), "ended by what failed"
+        learner.train(arguments("aip", "--init", str(tmp_path / "aap")), tmp_path / "aip", lines.append)
+    assert not psutil.Process().children()
+    assert read_policy_folder(tmp_path / "aip").trained == {"prior", "aap", "aip"}
+    for stage in ("prior", "aap", "aip"):
+        told = (tmp_path / stage / OUTPUT_FILE).read_text()
+        assert f"'{stage}' for '{Store.open(store).setting.task}' is done" in told
+        assert set(told.splitlines()) <= set(lines)
+
+
+def test_a_learner_that_is_killed_ends_the_stage(store: Path, config_file: Path, tmp_path: Path) -> None:
+    told = ["prior", "--store", str(store), "--out", str(tmp_path), "--config", str(config_file)]
+
+    def kill(line: str) -> None:
+        for child in psutil.Process().children():
+            child.kill()
+
+    with (
+        closing(Learner()) as learner,
+        pytest.raises(WorkerError, match=r"`adaafford train prior .*` ended with code -9"),
+    ):
+        learner.train(told, tmp_path, kill)
 
 
 def test_an_alternation_learns_round_by_round_and_goes_on_where_it_was_stopped(store: Path, tmp_path: Path) -> None:

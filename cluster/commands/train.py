@@ -2,13 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from cluster.settings import early_flags, layered, parse_flags
 from learner.configuration import LearnerConfig
 from shared.errors import UsageError
+
+if TYPE_CHECKING:
+    from learner.stages import Memory
 
 STAGES = ("prior", "aap", "aip", "where2act-interaction", "where2act-adaptation", "alternate")
 USAGE = f"""usage: adaafford train {{{",".join(STAGES)}}} --store STORE --out RUN [--init RUN] [SETTINGS]
@@ -43,8 +46,8 @@ class TrainCommand:
     """A TOML file of settings; flags are laid over it."""
 
 
-def main(args: list[str]) -> int:
-    """Train."""
+def main(args: list[str], memory: "Memory | None" = None) -> int:
+    """Train; `memory` is of the stages that this process ran before."""
     stage, rest = args[:1], args[1:]
     if stage in ([], ["-h"], ["--help"]):
         if stage:
@@ -56,11 +59,11 @@ def main(args: list[str]) -> int:
     early = early_flags(rest, "config")
     config = Path(early["config"]) if early["config"] else None
     defaults = TrainCommand(layered(LearnerConfig, None, config), tyro.MISSING, tyro.MISSING, config=config)
-    _train(stage[0], parse_flags(TrainCommand, rest, f"train {stage[0]}", defaults))
+    _train(stage[0], parse_flags(TrainCommand, rest, f"train {stage[0]}", defaults), memory)
     return 0
 
 
-def _train(stage: str, command: TrainCommand) -> None:
+def _train(stage: str, command: TrainCommand, memory: "Memory | None") -> None:
     from learner.alternation import alternate
     from learner.data import read_object_list
     from learner.hardware import hardware
@@ -78,4 +81,4 @@ def _train(stage: str, command: TrainCommand) -> None:
         if stage == "alternate":
             alternate(job, command.settings, used)
         else:
-            run_stage(job, command.settings, used)
+            run_stage(job, command.settings, used, memory)
