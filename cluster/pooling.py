@@ -26,6 +26,7 @@ from learner.training import without_nan
 from shared.configuration import parse
 from shared.errors import UsageError
 from shared.files import write_atomically
+from shared.store import Store
 
 MARKDOWN_FILE, CSV_FILE, JSON_FILE, FIGURE_FILE = (f"comparison.{kind}" for kind in ("md", "csv", "json", "png"))
 MOST = 1 << 40
@@ -77,6 +78,14 @@ class _Results(BaseModel):
 
 
 @dataclass(frozen=True, slots=True)
+class _Tested:
+    """What a run was found to do, and on what."""
+
+    results: _Results
+    novel_categories: bool
+
+
+@dataclass(frozen=True, slots=True)
 class PooledRow:
     """A method at a budget over all runs; shares with their 95% intervals over objects, None for no figure.
 
@@ -116,6 +125,7 @@ class Comparison:
         seeds: of the runs' evaluations.
         rollouts: trials in all runs.
         objects: different objects that were tested on.
+        novel_categories: whether nothing was trained on any of their categories.
         base_rate: of success among random interactions, mean over runs.
         rows: in the order of the paper's tables.
     """
@@ -124,6 +134,7 @@ class Comparison:
     seeds: tuple[int, ...]
     rollouts: int
     objects: int
+    novel_categories: bool
     base_rate: float
     rows: tuple[PooledRow, ...]
 
@@ -133,15 +144,20 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
 
     Args:
         runs: their folders.
-        evaluation: the name of a folder in each RUN/evaluations; None: the evaluation that a run ends with.
+        evaluation: how the name of one folder in each RUN/evaluations begins; None: the evaluation that a run ends
+            with.
 
     Raises:
-        UsageError: a folder is no run or lacks the evaluation, the runs are of different tasks, or share no method.
+        UsageError: a folder is no run or lacks the evaluation, the runs are of different tasks, share no method, or
+            only some were tested on novel categories.
         StoreError: a file is damaged.
     """
     if not runs or len({path.resolve() for path in runs}) < len(runs):
         raise UsageError("name the folders of one run or several, each once")
-    results = [_read(find(path)[0], evaluation) for path in runs]
+    tested = [_tested(find(path)[0], evaluation) for path in runs]
+    results = [each.results for each in tested]
+    if len({each.novel_categories for each in tested}) > 1:
+        raise UsageError("only some of the runs were tested on novel categories; compare them apart")
     if len(tasks := sorted({each.task for each in results})) > 1:
         raise UsageError(f"the runs are of different tasks ({', '.join(tasks)}); give runs of one task")
     common = set.intersection(*({(row.method, row.budget) for row in each.rows} for each in results))
@@ -154,18 +170,34 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         seeds=tuple(each.seed for each in results),
         rollouts=sum(each.rollouts for each in results),
         objects=len({content for each in results for content in each.contents.values()}),
+        novel_categories=tested[0].novel_categories,
         base_rate=rows[0].averages["base_rate"],
         rows=tuple(replace(row, gap_closed=share_of_gap(prior, row.shares["f_score"][0], oracle)) for row in rows),
     )
 
 
-def _read(run: RunFolder, evaluation: str | None) -> _Results:
-    folder = run.training("evaluate") if evaluation is None else run.evaluations / evaluation
-    if not (folder / RESULTS_FILE).is_file():
-        known = sorted(path.parent.name for path in run.evaluations.glob(f"*/{RESULTS_FILE}"))
-        there = f"it has {', '.join(known)}" if known else "finish the run, or evaluate it, first"
-        raise UsageError(f"{folder}: holds no {RESULTS_FILE}; {there}")
-    return parse(_Results, read_json(folder / RESULTS_FILE), str(folder / RESULTS_FILE))
+def _tested(run: RunFolder, evaluation: str | None) -> _Tested:
+    used = run.objects_used()
+    if evaluation is None:
+        folder, objects = run.training("evaluate"), used.test
+    else:
+        folder = _evaluation_called(run, evaluation)
+        objects = Store.open(folder / "store").setting.objects
+    path = folder / RESULTS_FILE
+    if not path.is_file():
+        raise UsageError(f"{folder}: holds no {RESULTS_FILE}; finish the run first")
+    return _Tested(parse(_Results, read_json(path), str(path)), used.are_novel(objects))
+
+
+def _evaluation_called(run: RunFolder, begins: str) -> Path:
+    """The one finished evaluation whose name begins so; names end in a digest that differs between seeds."""
+    known = sorted(path.parent for path in run.evaluations.glob(f"*/{RESULTS_FILE}"))
+    found = [path for path in known if path.name == begins] or [path for path in known if path.name.startswith(begins)]
+    if len(found) != 1:
+        there = f"it has {', '.join(path.name for path in known)}" if known else "evaluate the run first"
+        many = "several evaluations" if found else "no finished evaluation"
+        raise UsageError(f"{run.evaluations}: {many} called '{begins}'; {there}")
+    return found[0]
 
 
 def _place(key: tuple[str, int]) -> tuple[int, str, int]:
@@ -219,19 +251,25 @@ def write_comparison(out: Path, comparison: Comparison) -> None:
     write_atomically(out / CSV_FILE, as_csv(rows).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(comparison).encode())
     draw_comparison(comparison, out / FIGURE_FILE)
-    told = {"task": comparison.task, "seeds": comparison.seeds, "objects": comparison.objects, "rows": rows}
+    told = {"task": comparison.task, "seeds": comparison.seeds, "objects": comparison.objects}
+    told |= {"novel_categories": comparison.novel_categories, "rows": rows}
     write_atomically(out / JSON_FILE, json.dumps(told, indent=1, allow_nan=False).encode())
 
 
 def as_markdown(comparison: Comparison) -> str:
     """The pooled table beside the paper's figures, and the table run by run."""
-    paper = {str(name): each for name, each in published(comparison.task, novel_categories=False).items()}
+    paper = {
+        str(name): each
+        for name, each in published(comparison.task, novel_categories=comparison.novel_categories).items()
+    }
     runs = "run (seed" if len(comparison.seeds) == 1 else "runs (seeds"
+    novel = ", of categories that none saw" if comparison.novel_categories else ""
     lines = [
         f"# {comparison.task}: all methods",
         "",
-        f"{comparison.rollouts} trials on {comparison.objects} objects that no training saw, {len(comparison.seeds)} "
-        f"{runs} {_seeds(comparison)}). In percent; in brackets 95% bootstrap intervals over objects, all together. "
+        f"{comparison.rollouts} trials on {comparison.objects} objects that no training saw{novel}, "
+        f"{len(comparison.seeds)} {runs} {_seeds(comparison)}). In percent; in brackets "
+        "95% bootstrap intervals over objects, all together. "
         "F-score of the critic at threshold 0.5 on random interactions, of which "
         f"{_percent(comparison.base_rate)}% succeed. Sample-success: of the chosen action where the tries left the "
         "object, as in the paper; from the start: where they began. Gap closed: of that in F-score between Where2Act "

@@ -14,7 +14,7 @@ RUN/
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,10 @@ class ObjectsUsed(StrictModel):
     test: tuple[ObjectRef, ...]
     refused: tuple[tuple[str, str], ...]
     """(id, reason)."""
+
+    def are_novel(self, tested: Iterable[ObjectRef]) -> bool:
+        """Whether objects are of categories that nothing was trained on."""
+        return {ref.category for ref in tested}.isdisjoint(ref.category for ref in (*self.train, *self.validation))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,23 @@ import pytest
 from cluster.cli import run as adaafford
 from cluster.configuration import CampaignConfig
 from cluster.evaluation_tables import RESULTS_FILE
-from cluster.pooling import CSV_FILE, FIGURE_FILE, JSON_FILE, MARKDOWN_FILE, Comparison, pool, write_comparison
-from cluster.run_folder import begin
+from cluster.pooling import (
+    CSV_FILE,
+    FIGURE_FILE,
+    JSON_FILE,
+    MARKDOWN_FILE,
+    Comparison,
+    as_markdown,
+    pool,
+    write_comparison,
+)
+from cluster.run_folder import ObjectsUsed, begin
 from learner.bootstrap import ratio_interval
+from shared.configuration import CollectionConfig
 from shared.errors import UsageError
+from shared.plan import EvaluationConfig, ObjectRef, Setting
+from shared.store import Store
+from shared.tasks import task_named
 
 METHODS = (("where2act", 1), ("oracle", 0), ("ours-final", 1))
 
@@ -37,17 +50,26 @@ def counts_of(rng: np.random.Generator, objects: tuple[str, ...]) -> dict[str, l
 
 
 def make_run(
-    path: Path, seed: int, contents: dict[str, str], task: str = "push-faucet"
+    path: Path, seed: int, contents: dict[str, str], task: str = "push-faucet", trained_on: str = "Faucet"
 ) -> dict[str, dict[str, list[int]]]:
-    """A run with made-up results; returns the counts of each method."""
-    rng = np.random.default_rng(seed)
+    """A run with made-up results on faucets; returns the counts of each method."""
     run = begin(path, CampaignConfig(task=task))
+    test = tuple(ObjectRef(id=name, category="Faucet", content_hash=content) for name, content in contents.items())
+    train = (ObjectRef(id="t", category=trained_on, content_hash="0" * 64),)
+    used = ObjectsUsed(folder="objects", train=train, validation=(), test=test, refused=())
+    run.objects_file.write_text(used.model_dump_json())
+    return make_results(run.training("evaluate"), seed, contents, task)
+
+
+def make_results(folder: Path, seed: int, contents: dict[str, str], task: str) -> dict[str, dict[str, list[int]]]:
+    """A folder with made-up results; returns the counts of each method."""
+    rng = np.random.default_rng(seed)
     counts = {method: counts_of(rng, tuple(contents)) for method, _ in METHODS}
     figures = {"best_f": 0.5, "bce": 0.4, "auc": None, "base_rate": 0.25 + 0.1 * seed, "mean_tries": 1.0}
     rows = [{"method": m, "budget": b, "counts": counts[m], **figures} for m, b in METHODS]
     document = {"task": task, "seed": seed, "rollouts": 10, "contents": contents, "rows": rows}
-    run.training("evaluate").mkdir(parents=True)
-    (run.training("evaluate") / RESULTS_FILE).write_text(json.dumps(document))
+    folder.mkdir(parents=True)
+    (folder / RESULTS_FILE).write_text(json.dumps(document))
     return counts  # type: ignore[return-value]
 
 
@@ -97,14 +119,44 @@ def test_the_files_hold_it(runs: tuple[list[Path], object], tmp_path: Path) -> N
     assert (tmp_path / "out" / FIGURE_FILE).read_bytes().startswith(b"\x89PNG")
 
 
+def test_novel_categories_stand_beside_the_papers_figures_of_such(tmp_path: Path) -> None:
+    for trained_on, figure in (("Door", "*77.6*"), ("Faucet", "*72.8*")):
+        path = tmp_path / trained_on
+        make_run(path, 1, {"a": "1" * 64}, task="push", trained_on=trained_on)
+        found = pool([path], None)
+        assert found.novel_categories == (trained_on == "Door")
+        # The paper's F-score of ours-final after one try, on its novel and on its training categories.
+        assert figure in as_markdown(found)
+
+
+def test_evaluations_of_several_seeds_are_found_by_how_their_names_begin(
+    runs: tuple[list[Path], object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    contents, numbers = {"r": "7" * 64}, iter(range(10))
+    ref = ObjectRef(id="r", category="Faucet", content_hash=contents["r"])
+    for path, digest in zip(runs[0], ("11", "22"), strict=True):
+        for name in ("real", "realm"):
+            folder = path / "evaluations" / f"{name}-{digest}"
+            make_results(folder, next(numbers), contents, "push-faucet")
+            collection = task_named("push-faucet").resolve(CollectionConfig())
+            told = {"kind": "evaluation", "task": "push-faucet", "seed": 1, "objects": (ref,)}
+            Store.create(folder / "store", Setting(**told, collection=collection, evaluation=EvaluationConfig()))
+    found = pool(runs[0], "real-")
+    assert (found.objects, found.seeds) == (1, (0, 2))
+    assert adaafford(["compare", str(runs[0][0]), "--evaluation", "real"]) == 2
+    assert "several evaluations called 'real'; it has real-11, realm-11" in capsys.readouterr().err
+
+
 def test_what_cannot_be_pooled_is_said_in_a_line(
     runs: tuple[list[Path], object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     make_run(tmp_path / "door", 3, {"a": "3" * 64}, task="pull-closed-door")
+    make_run(tmp_path / "novel", 4, {"a": "4" * 64}, trained_on="Door")
     for arguments, message in (
         ([str(runs[0][0]), str(tmp_path / "door")], "different tasks (pull-closed-door, push-faucet)"),
         ([str(tmp_path)], "holds no run"),
-        ([str(runs[0][0]), "--evaluation", "real"], "finish the run, or evaluate it, first"),
+        ([str(runs[0][0]), "--evaluation", "real"], "no finished evaluation called 'real'; evaluate the run first"),
+        ([str(runs[0][0]), str(tmp_path / "novel")], "only some of the runs were tested on novel categories"),
         ([], "name the folders"),
         ([str(runs[0][0])] * 2, "each once"),
     ):

@@ -15,7 +15,7 @@ from cluster.reporting.page import Page, Picture, Section, render, shortened
 from cluster.reporting.proposals import proposals_section
 from cluster.reporting.results import Results, further_section, read_results, results_section, tiles
 from cluster.reporting.training import training_section
-from cluster.run_folder import ObjectsUsed, RunFolder, read_json
+from cluster.run_folder import RunFolder, read_json
 from shared.adaptation import Adapter
 from shared.files import read_bounded, write_atomically
 from shared.policy import Policy
@@ -43,9 +43,9 @@ def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say
     policy = Policy.from_files(store.read_policy(store.policy_versions()[-1]))
     adapter, found = Adapter(policy), first_episodes(evaluation)
     say("drawing tables, curves and clouds")
-    results = read_results(
-        run.training("evaluate") / RESULTS_FILE, config.task, novel_categories=_novel(evaluation, run.objects_used())
-    )
+    used = run.objects_used()
+    novel = used.are_novel(used.test)
+    results = read_results(run.training("evaluate") / RESULTS_FILE, config.task, novel_categories=novel)
     further = _further(run)
     sections = [
         *([_picture(run.picture)] if run.picture.is_file() else []),
@@ -71,15 +71,9 @@ def _further(run: RunFolder) -> list[tuple[str, Results]]:
     """What `adaafford evaluate` made of the run, by name, as far as it is finished."""
     used, found = run.objects_used(), []
     for path in sorted(run.evaluations.glob(f"*/{RESULTS_FILE}"))[:MAX_FURTHER]:
-        novel = _novel(Store.open(path.parent / "store"), used)
+        novel = used.are_novel(Store.open(path.parent / "store").setting.objects)
         found.append((path.parent.name, read_results(path, novel_categories=novel)))
     return found
-
-
-def _novel(evaluation: Store, used: ObjectsUsed) -> bool:
-    """Whether an evaluation's objects are of categories that nothing was trained on."""
-    tested = {ref.category for ref in evaluation.setting.objects}
-    return tested.isdisjoint(ref.category for ref in (*used.train, *used.validation))
 
 
 def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Callable[[str], None]) -> Section:
