@@ -162,24 +162,25 @@ class _Costs:
         yield self._collection("collect-random", rollouts.total(rollouts.random, self.collected_on), tries=0)
         adopted = self.config.start_from is not None
         if not adopted:
-            yield self._training("train-prior", self._prior_s())
+            yield self._training("train-prior", self._prior_s(), encoders=1)
         for version in range(1, self.config.alternations + 2):
             if version > 1:
                 count = rollouts.total(rollouts.aip, self.collected_on)
                 yield self._collection(f"collect-aip-{version - 1}", count, self.config.collection.rollout.context)
             if version > 1 or not adopted:
-                yield self._training(f"train-aap-{version}", self._aap_s(first=version == 1))
-                yield self._training(f"train-aip-{version}", self._aip_s())
+                first, own = version == 1, learner.aip.training == "paper"
+                yield self._training(f"train-aap-{version}", self._aap_s(first=first), encoders=1 if first else 2)
+                yield self._training(f"train-aip-{version}", self._aip_s(), encoders=int(own))
         for name in baselines_of(self.config.evaluation.methods):
             if name == "where2act-interaction":
                 told = learner.interaction
                 clouds = told.batch_rollouts * self._clouds_a_rollout(0)
                 rows = told.batch_rollouts * told.rows_per_rollout * (TRIES + 1)
-                seconds = self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance)
+                seconds, encoders = self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance), 1
             else:
                 rows = learner.adaptation.batch_rollouts * learner.adaptation.rows_per_rollout
-                seconds = self._steps_s(learner.adaptation.steps, 0, rows * learner.adaptation.context)
-            yield self._training(f"train-{name}", seconds)
+                seconds, encoders = self._steps_s(learner.adaptation.steps, 0, rows * learner.adaptation.context), 0
+            yield self._training(f"train-{name}", seconds, encoders)
         yield self._evaluation(rollouts.total(rollouts.evaluation, self.tested))
 
     def _collection(self, stage: str, rollouts: int, tries: int) -> StageCost:
@@ -213,9 +214,10 @@ class _Costs:
             self._stored_bytes(rollouts, interactions, clouds) + self.weights_bytes,
         )
 
-    def _training(self, stage: str, seconds: float) -> StageCost:
-        """A stage encodes every cloud once or twice for its frozen networks, apart from its steps."""
-        return StageCost(stage, 0, seconds + self.clouds * self.encode_s, LEFT_BY_TRAINING * self.weights_bytes)
+    def _training(self, stage: str, seconds: float, encoders: int) -> StageCost:
+        """Its steps, and all clouds under encoders that the stages before it since the last collection did not have."""
+        encoding_s = self.clouds * encoders * FORWARD_SHARE * self.encode_s
+        return StageCost(stage, 0, seconds + encoding_s, LEFT_BY_TRAINING * self.weights_bytes)
 
     def _prior_s(self) -> float:
         told = self.config.learner.prior
