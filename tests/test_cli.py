@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from cluster.cli import COMMANDS, run
+from shared.categories import TEST_CATEGORIES
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *args: str) -> str:
@@ -105,6 +106,12 @@ def test_a_folder_with_something_else_is_left_alone(capsys: pytest.CaptureFixtur
 def test_a_store_of_another_schema_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     (tmp_path / "store.json").write_text(json.dumps({"schema_version": 999}))
     assert "schema" in complaint(capsys, "store", "info", str(tmp_path))
+
+
+def test_objects_are_made_of_a_group_of_categories(tmp_path: Path) -> None:
+    assert run(["objects", "generate", str(tmp_path), "--per-category", "1", "--categories", "test", "Box"]) == 0
+    made = {folder.name.removesuffix("-0000") for folder in tmp_path.iterdir()}
+    assert made == {name.lower() for name in (*TEST_CATEGORIES, "Box")}
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

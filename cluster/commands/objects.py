@@ -23,7 +23,7 @@ class GenerateCommand:
     per_category: Annotated[int, Field(ge=1)] = 4
     """Objects of each category."""
     categories: tuple[str, ...] = ()
-    """Only these; all where none is named."""
+    """Only these; "train" and "test" stand for the paper's ten and five. All where none is named."""
     seed: int = 1
     """Everything random derives from it."""
 
@@ -99,8 +99,9 @@ def main(args: list[str]) -> int:
 def _generate(command: GenerateCommand) -> int:
     from collector.procedural.catalogue import CATEGORIES
     from collector.procedural.writing import generate
+    from shared.categories import expanded
 
-    counts = dict.fromkeys(command.categories or CATEGORIES, command.per_category)
+    counts = dict.fromkeys(expanded(command.categories) or CATEGORIES, command.per_category)
     made = generate(command.out, counts, command.seed)
     print(f"{len(made)} objects of {len(counts)} categories in {command.out}")
     return 0
