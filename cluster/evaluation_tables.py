@@ -53,11 +53,11 @@ class Table:
     Attributes:
         task: what was evaluated.
         seed: of the evaluation.
-        objects: how many it drew from.
+        objects: how many there were trials of.
         rollouts: how many trials in all; each fills the interactions anew for every method.
         policy_version: of the policy that was evaluated.
         store_digest: of the interactions that the figures are of.
-        contents: of the objects that were drawn from, SHA-256 by id, since runs call other objects the same.
+        contents: of these objects, SHA-256 by id, since runs call other objects the same.
         rows: a row for each method and budget: the fields of `learner.evaluation.EvaluationRow` ("best_f" for short),
             and "gap_closed", the share of the gap in F-score between Where2Act and the oracle; None for no figure.
     """

@@ -43,18 +43,19 @@ def judge(store: Store, version: int, oracle: Path) -> Table:
     network = Policy.from_files(store.read_policy(version)).config
     told = read_oracle(oracle, network) if oracle.is_file() else None
     budgets = sorted(config.budgets)
-    rows = []
+    rows: list[EvaluationRow] = []
     for row in evaluate_store(store, version, budgets, told):
         # The prior knows nothing of tries: all its actions count at every budget, to stand beside the others.
         rows += [replace(row, budget=budget) for budget in budgets] if row.method == PRIOR_METHOD else [row]
+    tried = {name for row in rows for name in row.counts.object}
     return Table(
         task=store.setting.task,
         seed=store.setting.seed,
-        objects=len(store.setting.objects),
+        objects=len(tried),
         rollouts=sum(shard.stop - shard.start for shard in store.committed()),
         policy_version=version,
         store_digest=store.digest(),
-        contents={ref.id: ref.content_hash for ref in store.setting.objects},
+        contents={ref.id: ref.content_hash for ref in store.setting.objects if ref.id in tried},
         rows=tuple(_plain(row) | {"gap_closed": _finite(_gap_closed(row, rows))} for row in rows),
     )
 

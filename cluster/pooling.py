@@ -169,7 +169,7 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         task=tasks[0],
         seeds=tuple(each.seed for each in results),
         rollouts=sum(each.rollouts for each in results),
-        objects=len({content for each in results for content in each.contents.values()}),
+        objects=len({each.contents.get(name, name) for each in results for name in each.rows[0].counts.object}),
         novel_categories=tested[0].novel_categories,
         base_rate=rows[0].averages["base_rate"],
         rows=tuple(replace(row, gap_closed=share_of_gap(prior, row.shares["f_score"][0], oracle)) for row in rows),

@@ -195,14 +195,17 @@ def test_a_stopped_evaluation_ends_in_the_same_table(
 
     def dying(*args: object) -> object:
         calls.append(args)
-        if len(calls) == 3:
+        if len(calls) == 2:
             raise KeyboardInterrupt
         return execute(*args)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patch, pytest.raises((KeyboardInterrupt, JobError)):
         patch.setattr(Worker, "execute", dying)
         evaluate_run(finished, FAST, stopped)
-    assert len(Store.open(stopped / "store").committed()) == 2
+    begun = Store.open(stopped / "store")
+    assert len(begun.committed()) == 1
+    # One trial of one object; the other has had none.
+    assert judge(begun, 1, tmp_path / "no-oracle").objects == 1
     assert not (stopped / RESULTS_FILE).exists()
     evaluate_run(finished, FAST, stopped)
     for name in (RESULTS_FILE, CSV_FILE, MARKDOWN_FILE):
