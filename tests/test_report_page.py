@@ -150,7 +150,7 @@ def as_evaluated(rollout: RolloutRecord) -> RolloutRecord:
 def write_trainings(made: RunFolder) -> None:
     rows = [row_of(method, budget) for method in ("where2act", "ours-final", ATTACK[:100]) for budget in (1, 2)]
     for stage, name, text in (
-        ("evaluate", "results.json", json.dumps({"rows": [row.model_dump() for row in rows]})),
+        ("evaluate", "results.json", json.dumps({"objects": 3, "rows": [row.model_dump() for row in rows]})),
         ("prior", "metrics.jsonl", json.dumps({"step": 5, "score": 0.5, f"loss_{ATTACK}": 0.4})),
     ):
         made.training(stage).mkdir(parents=True)
@@ -220,6 +220,7 @@ def test_the_page_shows_everything_and_stays_small(html: str, elements: Elements
     assert len(html) < 10 << 20
     assert html.count("plotly.js v") == 1
     assert "40\u201362" in html, "the interval of the F-score, percent"
+    assert "judged on 3 others" in html, "the objects that there were trials of"
     assert "adaafford report" in html, "how to have the hidden facts tried"
 
 
@@ -234,7 +235,7 @@ def test_results_that_are_none_are_one_line(run: RunFolder, capsys: pytest.Captu
     path = run.training("evaluate") / "results.json"
     kept = path.read_text()
     try:
-        path.write_text(json.dumps({"rows": [{"method": "ours-final", "budget": "many"}]}))
+        path.write_text(json.dumps({"objects": 1, "rows": [{"method": "ours-final", "budget": "many"}]}))
         assert run_command(["report", str(run.path), "--no-experiments"]) == 2
         assert "rows.0.budget" in capsys.readouterr().err
     finally:

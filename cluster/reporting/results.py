@@ -59,6 +59,7 @@ class ResultRows(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     task: str = Field("", max_length=100)
+    objects: int = Field(ge=0)
     rows: tuple[ResultRow, ...]
 
 
@@ -70,11 +71,13 @@ class Results:
         task: what was evaluated.
         rows: a method and a budget each.
         novel_categories: whether the test objects are of categories that nothing was trained on.
+        objects: how many there were trials of.
     """
 
     task: str
     rows: tuple[ResultRow, ...]
     novel_categories: bool = False
+    objects: int = 0
 
     @property
     def budgets(self) -> list[int]:
@@ -124,7 +127,7 @@ def read_results(path: Path, task: str = "", *, novel_categories: bool = False) 
         UsageError: it does not hold results.
     """
     read = parse(ResultRows, read_json(path), str(path))
-    return Results(read.task or task, read.rows, novel_categories)
+    return Results(read.task or task, read.rows, novel_categories, read.objects)
 
 
 def results_section(results: Results) -> Section:

@@ -59,7 +59,7 @@ def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say
     ]
     page = Page(
         title=f"AdaAfford: {config.task}",
-        subtitle=_subtitle(summary, config),
+        subtitle=_subtitle(summary, config, results),
         tiles=tiles(results),
         sections=tuple(sections),
         facts=_facts(summary, run),
@@ -98,13 +98,14 @@ def _picture(path: Path) -> Section:
     return Section("glance", "At a glance", pictures=(picture,))
 
 
-def _subtitle(summary: Mapping[str, Any], config: CampaignConfig) -> str:
+def _subtitle(summary: Mapping[str, Any], config: CampaignConfig, results: Results) -> str:
     objects = summary["objects"]
     minutes = summary["wall_seconds"] / 60
+    workers = f"{config.workers} worker{'' if config.workers == 1 else 's'}"
     return (
         f"Affordance that adapts to one object after a few tries: {summary['interactions']:,} interactions with "
-        f"{len(objects['train'])} objects, judged on {len(objects['test'])} others, in {minutes:.0f} minutes "
-        f"(seed {config.seed}, {config.workers} workers)."
+        f"{len(objects['train'])} objects, judged on {results.objects} others, in {minutes:.0f} minutes "
+        f"(seed {config.seed}, {workers})."
     )
 
 
