@@ -1,7 +1,6 @@
 """Adaptation curves of finished trainings, as curve.json, curve.csv, curve.md, and curve.png to look at."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from cluster.cells import percent
 from cluster.evaluation_tables import as_csv
 from learner.comparison import CurveRow
 from learner.curve import ProposalGain
@@ -92,13 +92,13 @@ def as_markdown(curves: Curves) -> str:
             row.name,
             CRITICS[row.critic],
             str(row.tries),
-            _percent(row.f_score, row.f_score_low, row.f_score_high),
-            _percent(row.closed, row.closed_low, row.closed_high),
-            _percent(row.best_f_score),
+            percent(row.f_score, (row.f_score_low, row.f_score_high)),
+            percent(row.closed, (row.closed_low, row.closed_high)),
+            percent(row.best_f_score),
             f"{row.bce:.4f}",
             f"{row.auc:.3f}",
             f"{row.calibration_error:.3f}",
-            _percent(row.closed_from_none),
+            percent(row.closed_from_none),
         ]
         lines.append("| " + " | ".join(cells) + " |")
     lines += ["", "By run (F-score / gap closed):", "", *_by_run(curves.rows)]
@@ -131,7 +131,7 @@ def _by_run(rows: Sequence[CurveRow]) -> list[str]:
         cells = []
         for critic, tries in asked:
             row = found.get((name, run, critic, tries))
-            cells.append("-" if row is None else f"{_percent(row.f_score)} / {_percent(row.closed)}")
+            cells.append("-" if row is None else f"{percent(row.f_score)} / {percent(row.closed)}")
         lines.append(f"| {name} | {run} | " + " | ".join(cells) + " |")
     return lines
 
@@ -176,9 +176,3 @@ def _bounds(axes: Axes, rows: Sequence[CurveRow]) -> None:
         if row.critic in ("where2act", "oracle"):
             colour = "0.5" if row.critic == "where2act" else "black"
             axes.axhline(row.f_score, color=colour, linewidth=1, label=CRITICS[row.critic])
-
-
-def _percent(value: float, low: float = math.nan, high: float = math.nan) -> str:
-    if math.isnan(value):
-        return "-"
-    return f"{100 * value:.1f}" + ("" if math.isnan(low) else f" [{100 * low:.1f}, {100 * high:.1f}]")

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from cluster.cells import percent
 from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
 from shared.files import write_atomically
 from shared.methods import METHODS, MethodName
@@ -116,9 +117,8 @@ def as_markdown(table: Table) -> str:
 
 def _cell(row: Mapping[str, Any], name: str) -> str:
     value = row[name]
+    if name in _PERCENT:
+        return percent(value, (row.get(f"{name}_low"), row.get(f"{name}_high")))
     if value is None:
         return "-"
-    if name in _PERCENT:
-        low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
-        return f"{100 * value:.1f}" + ("" if low is None or high is None else f" [{100 * low:.1f}, {100 * high:.1f}]")
     return f"{value:.3g}" if isinstance(value, float) else str(value)

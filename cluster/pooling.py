@@ -17,8 +17,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from cluster.cells import number, percent
 from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, RESULTS_FILE, WITHOUT_TRIES, as_csv, share_of_gap
-from cluster.reporting.published import published
+from cluster.reporting.published import PUBLISHED_MEASURES, published_figure
 from cluster.reporting.style import COLOURS, SOFT
 from cluster.run_folder import RunFolder, find, read_json
 from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD, ObjectCounts
@@ -94,6 +95,7 @@ class PooledRow:
         budget: how many tries.
         shares: of each of `MEASURES`: the figure, and where its interval begins and ends.
         by_run: of each of `MEASURES`: the figure in each run.
+        paper: of each of `PUBLISHED_MEASURES`: the paper's own figure, percent; None where it has none.
         gap_closed: the share of the gap in F-score between Where2Act and the oracle.
         trials: how many actions were executed where tries had left an object.
         averages: of each of `AVERAGED`, the mean over runs.
@@ -103,6 +105,7 @@ class PooledRow:
     budget: int
     shares: Mapping[str, tuple[float, float, float]]
     by_run: Mapping[str, tuple[float, ...]]
+    paper: Mapping[str, float | None]
     gap_closed: float
     trials: int
     averages: Mapping[str, float]
@@ -112,7 +115,8 @@ class PooledRow:
         flat: dict[str, Any] = {"method": self.method, "budget": self.budget}
         for name, (value, low, high) in self.shares.items():
             flat |= {name: value, f"{name}_low": low, f"{name}_high": high}
-            flat |= {f"{name}_run_{number}": each for number, each in enumerate(self.by_run[name], start=1)}
+            flat |= {f"{name}_run_{run}": each for run, each in enumerate(self.by_run[name], start=1)}
+        flat |= {f"paper_{name}": None if value is None else value / 100 for name, value in self.paper.items()}
         return without_nan(flat | {"gap_closed": self.gap_closed, "trials": self.trials} | dict(self.averages))
 
 
@@ -163,14 +167,15 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
     common = set.intersection(*({(row.method, row.budget) for row in each.rows} for each in results))
     if not common:
         raise UsageError("the runs share no method and budget; evaluate them alike")
-    rows = [_pooled(method, budget, results) for method, budget in sorted(common, key=_place)]
+    novel = tested[0].novel_categories
+    rows = [_pooled(method, budget, results, novel) for method, budget in sorted(common, key=_place)]
     prior, oracle = (_share_of(rows, method) for method in (PRIOR_METHOD, ORACLE_METHOD))
     return Comparison(
         task=tasks[0],
         seeds=tuple(each.seed for each in results),
         rollouts=sum(each.rollouts for each in results),
         objects=len({each.contents.get(name, name) for each in results for name in each.rows[0].counts.object}),
-        novel_categories=tested[0].novel_categories,
+        novel_categories=novel,
         base_rate=rows[0].averages["base_rate"],
         rows=tuple(replace(row, gap_closed=share_of_gap(prior, row.shares["f_score"][0], oracle)) for row in rows),
     )
@@ -205,7 +210,8 @@ def _place(key: tuple[str, int]) -> tuple[int, str, int]:
     return ORDER.index(method) if method in ORDER else len(ORDER), method, budget
 
 
-def _pooled(method: str, budget: int, results: Sequence[_Results]) -> PooledRow:
+def _pooled(method: str, budget: int, results: Sequence[_Results], novel_categories: bool) -> PooledRow:
+    task = results[0].task
     rows = [next(row for row in each.rows if (row.method, row.budget) == (method, budget)) for each in results]
     counts = [row.counts for row in rows]
     together = _together([_by_content(each, contents.contents) for each, contents in zip(counts, results, strict=True)])
@@ -218,6 +224,10 @@ def _pooled(method: str, budget: int, results: Sequence[_Results]) -> PooledRow:
         budget=budget,
         shares={name: getattr(together, name)() for name in MEASURES},
         by_run={name: tuple(getattr(each, name)()[0] for each in counts) for name in MEASURES},
+        paper={
+            measure: published_figure(task, method, budget, measure, novel_categories=novel_categories)
+            for measure in PUBLISHED_MEASURES
+        },
         gap_closed=math.nan,
         trials=sum(together.trials),
         averages=averages,
@@ -258,10 +268,6 @@ def write_comparison(out: Path, comparison: Comparison) -> None:
 
 def as_markdown(comparison: Comparison) -> str:
     """The pooled table beside the paper's figures, and the table run by run."""
-    paper = {
-        str(name): each
-        for name, each in published(comparison.task, novel_categories=comparison.novel_categories).items()
-    }
     runs = "run (seed" if len(comparison.seeds) == 1 else "runs (seeds"
     novel = ", of categories that none saw" if comparison.novel_categories else ""
     lines = [
@@ -271,7 +277,7 @@ def as_markdown(comparison: Comparison) -> str:
         f"{len(comparison.seeds)} {runs} {_seeds(comparison)}). In percent; in brackets "
         "95% bootstrap intervals over objects, all together. "
         "F-score of the critic at threshold 0.5 on random interactions, of which "
-        f"{_percent(comparison.base_rate)}% succeed. Sample-success: of the chosen action where the tries left the "
+        f"{percent(comparison.base_rate)}% succeed. Sample-success: of the chosen action where the tries left the "
         "object, as in the paper; from the start: where they began. Gap closed: of that in F-score between Where2Act "
         "and the oracle, which is told the hidden facts. The paper's figures are of other objects and another "
         "simulator: orders and trends can be compared.",
@@ -280,19 +286,18 @@ def as_markdown(comparison: Comparison) -> str:
         "| --- |" + " ---: |" * (len(COLUMNS) - 1),
     ]
     for row in comparison.rows:
-        told = paper.get(row.method)
         cells = [
             row.method,
             str(row.budget),
-            _interval(row.shares["f_score"]),
-            _percent_of_paper(told.at(row.budget, "f_score") if told else None),
-            _interval(row.shares["sample_success"]),
-            _percent_of_paper(told.at(row.budget, "sample_success") if told else None),
-            _interval(row.shares["start_success"]),
-            _percent(row.gap_closed),
-            _percent(row.averages["best_f"]),
-            _number(row.averages["bce"]),
-            _number(row.averages["auc"]),
+            _with_limits(row.shares["f_score"]),
+            _of_paper(row.paper["f_score"]),
+            _with_limits(row.shares["sample_success"]),
+            _of_paper(row.paper["sample_success"]),
+            _with_limits(row.shares["start_success"]),
+            percent(row.gap_closed),
+            percent(row.averages["best_f"]),
+            number(row.averages["bce"]),
+            number(row.averages["auc"]),
         ]
         lines.append("| " + " | ".join(cells) + " |")
     columns = [f"seed {seed}" for seed in comparison.seeds]
@@ -305,7 +310,7 @@ def as_markdown(comparison: Comparison) -> str:
     ]
     for row in comparison.rows:
         each = zip(*(row.by_run[name] for name in MEASURES), strict=True)
-        shown = [" / ".join(map(_percent, values)) for values in each]
+        shown = [" / ".join(map(percent, values)) for values in each]
         lines.append(f"| {row.method} | {row.budget} | " + " | ".join(shown) + " |")
     return "\n".join(lines) + "\n"
 
@@ -344,18 +349,9 @@ def _seeds(comparison: Comparison) -> str:
     return ", ".join(map(str, comparison.seeds))
 
 
-def _interval(share: tuple[float, float, float]) -> str:
-    value, low, high = share
-    return "-" if math.isnan(value) else f"{100 * value:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+def _with_limits(share: tuple[float, float, float]) -> str:
+    return percent(share[0], share[1:], decimals=0)
 
 
-def _percent(value: float) -> str:
-    return "-" if math.isnan(value) else f"{100 * value:.1f}"
-
-
-def _percent_of_paper(value: float | None) -> str:
-    return "" if value is None else f"*{value:.1f}*"
-
-
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.3f}"
+def _of_paper(figure: float | None) -> str:
+    return "" if figure is None else f"*{figure:.1f}*"

@@ -116,6 +116,8 @@ def test_the_files_hold_it(runs: tuple[list[Path], object], tmp_path: Path) -> N
     read = list(csv.DictReader((tmp_path / "out" / CSV_FILE).read_text().splitlines()))
     assert [row["method"] for row in read] == ["where2act", "ours-final", "oracle"]
     assert float(read[1]["f_score"]) == pytest.approx(found.rows[1].shares["f_score"][0])
+    assert [row["paper_f_score"] for row in read] == ["0.6492", "0.7742", ""]
+    assert "paper_start_success" not in read[0]
     assert json.loads((tmp_path / "out" / JSON_FILE).read_text())["seeds"] == [0, 1]
     assert (tmp_path / "out" / FIGURE_FILE).read_bytes().startswith(b"\x89PNG")
 

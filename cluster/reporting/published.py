@@ -5,11 +5,12 @@ Objects, physics and random draws differ, so the absolute figures are marks and 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from shared.methods import MethodName
 
 BUDGETS = (1, 2, 4)
+PUBLISHED_MEASURES = ("f_score", "sample_success")
+"""What the paper has figures of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,8 +20,10 @@ class Published:
     f_score: tuple[float, ...]
     sample_success: tuple[float, ...]
 
-    def at(self, budget: int, measure: Literal["f_score", "sample_success"]) -> float | None:
+    def at(self, budget: int, measure: str) -> float | None:
         """The figure after a budget of tries; None where the paper has none."""
+        if measure not in PUBLISHED_MEASURES:
+            return None
         figures = self.f_score if measure == "f_score" else self.sample_success
         if len(figures) == 1:
             return figures[0]
@@ -110,3 +113,17 @@ def published(task: str, *, novel_categories: bool) -> Mapping[MethodName, Publi
         novel_categories: whether on categories that nothing was trained on.
     """
     return (_ON_NOVEL_CATEGORIES if novel_categories else _ON_TRAINED_CATEGORIES).get(task, {})
+
+
+def published_figure(task: str, method: str, budget: int, measure: str, *, novel_categories: bool) -> float | None:
+    """One of the paper's figures, percent; None where it has none.
+
+    Args:
+        task: what was evaluated.
+        method: any name.
+        budget: how many tries.
+        measure: one of `PUBLISHED_MEASURES`, or another, of which the paper has none.
+        novel_categories: whether on categories that nothing was trained on.
+    """
+    told = {str(name): each for name, each in published(task, novel_categories=novel_categories).items()}
+    return told[method].at(budget, measure) if method in told else None

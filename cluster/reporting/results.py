@@ -8,9 +8,10 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from pydantic import BaseModel, ConfigDict, Field
 
+from cluster.cells import number, percent
 from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, WITHOUT_TRIES, Measure
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
-from cluster.reporting.published import published
+from cluster.reporting.published import published, published_figure
 from cluster.reporting.style import COLOURS, SOFT, laid_out
 from cluster.run_folder import read_json
 from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD
@@ -103,10 +104,9 @@ class Results:
 
     def of_paper(self, method: str, budget: int, measure: Measure) -> float | None:
         """The paper's own figure, percent, where we have a row as well."""
-        told = {str(name): each for name, each in published(self.task, novel_categories=self.novel_categories).items()}
-        if measure == "start_success" or method not in told or self.row(method, budget) is None:
+        if self.row(method, budget) is None:
             return None
-        return told[method].at(budget, measure)
+        return published_figure(self.task, method, budget, measure, novel_categories=self.novel_categories)
 
     def best(self, measure: Measure, budget: int) -> float | None:
         """The highest figure of a column, the oracle's left out."""
@@ -165,10 +165,10 @@ def tiles(results: Results) -> tuple[Tile, ...]:
     shown = []
     if made is not None:
         after = f"after {budget} tries" if budget != 1 else "after one try"
-        shown.append(Tile(_percent(made.f_score), f"F-score of {BEST_METHOD} {after}"))
-        shown.append(Tile(_percent(made.sample_success), f"sample-success of {BEST_METHOD} {after}"))
+        shown.append(Tile(percent(made.f_score), f"F-score of {BEST_METHOD} {after}"))
+        shown.append(Tile(percent(made.sample_success), f"sample-success of {BEST_METHOD} {after}"))
     if prior is not None:
-        without = f"{_percent(prior.f_score)} / {_percent(prior.sample_success)}"
+        without = f"{percent(prior.f_score)} / {percent(prior.sample_success)}"
         shown.append(Tile(without, f"F-score / sample-success of {PRIOR_METHOD}, which tries nothing"))
     if made is not None and made.gap_closed is not None:
         label = f"of the gap in F-score between {PRIOR_METHOD} and the oracle closed"
@@ -203,7 +203,7 @@ def details_of(results: Results) -> Table:
     names = [name for name in ResultRow.model_fields if name != "method"]
     head: Row = (Cell("method", kind="name"), *(Cell(name.replace("_", " ")) for name in names))
     body = tuple(
-        (Cell(row.method, kind="name"), *(Cell(_number(getattr(row, name))) for name in names)) for row in results.rows
+        (Cell(row.method, kind="name"), *(Cell(number(getattr(row, name))) for name in names)) for row in results.rows
     )
     return Table((head,), body, "All figures of all rows", folded=True)
 
@@ -278,13 +278,3 @@ def _line(name: str, x: Sequence[int], y: Sequence[float], line: Mapping[str, ob
     return go.Scatter(
         x=x, y=y, name=label, legendgroup=label, mode="lines+markers", line=dict(line), hovertemplate="%{y:.1f}"
     )
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f}"
-
-
-def _number(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
