@@ -1,6 +1,7 @@
-"""affordance.png: one test object as the camera sees it, before and after each try, and what each try was."""
+"""Affordance as the camera sees it, before and after tries: affordance.png of a run, and what a benchmark draws."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from cluster.episodes import first_episodes, most_telling
+from cluster.reporting.words import hidden, verdict
 from shared.adaptation import Adapter
 from shared.policy import Policy
 from shared.store import Store
@@ -19,6 +21,23 @@ ARROW_LENGTH = 0.25
 """Of the arrow along the approach, in the cloud's units."""
 BODY_COLOUR = "0.8"
 COLOURS = "viridis"
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One cloud, coloured.
+
+    Attributes:
+        observation: the cloud.
+        affordance: of its points, [N].
+        title: above it.
+        tried: drawn as an arrow.
+    """
+
+    observation: Observation
+    affordance: Float32
+    title: str
+    tried: Interaction | None = None
 
 
 def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
@@ -35,33 +54,29 @@ def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
     if episode is None:
         return False
     chosen, history = episode.rollout, episode.history
-    panels = len(history) + 1
-    figure = Figure(figsize=(3.6 * panels, 4.6), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    grid: Sequence[Axes] = figure.subplots(1, panels, squeeze=False)[0]
-    dynamics = chosen.dynamics
-    figure.suptitle(
-        f"{policy.task}: {chosen.object.category} {chosen.object.id}, not seen in training "
-        f"(hidden: mass {dynamics.part_mass:.2f}, joint friction {dynamics.joint_friction:.2f}, "
-        f"surface friction {dynamics.surface_friction:.2f}, {dynamics.direction.value})",
-        fontsize=9,
-        parse_math=False,
-    )
-    observations = [history[0].observation, *(interaction.observation for interaction in history)]
-    heat = [adapter.affordance(observation, history[:count]) for count, observation in enumerate(observations)]
-    most = max(float(scores[o.movable].max()) for scores, o in zip(heat, observations, strict=True))
-    images = [_draw_cloud(*panel, most) for panel in zip(grid, observations, heat, strict=True)]
-    for count, axes in enumerate(grid):
-        if count == 0:
-            axes.set_title("before any try", fontsize=9)
-            continue
-        outcome = history[count - 1].outcome
-        _draw_arrow(axes, history[count - 1])
-        verdict = "success" if outcome.success else outcome.kind.value.replace("ok", "no success")
-        axes.set_title(f"after try {count}: {verdict}, moved {outcome.motion:.3f}", fontsize=9)
-    figure.colorbar(images[0], ax=list(grid), shrink=0.7, label="affordance (AAP)")
-    figure.savefig(out, format="png")
+    first = history[0].observation
+    panels = [Panel(first, adapter.affordance(first, []), "before any try")]
+    for count, tried in enumerate(history, start=1):
+        heat = adapter.affordance(tried.observation, history[:count])
+        title = f"after try {count}: {verdict(tried.outcome)}"
+        panels.append(Panel(tried.observation, heat, title, tried))
+    title = f"{policy.task}: {chosen.object.category} {chosen.object.id}, not seen in training"
+    draw_panels([panels], f"{title} (hidden: {hidden(chosen.dynamics)})", out)
     return True
+
+
+def draw_panels(rows: Sequence[Sequence[Panel]], title: str, out: Path) -> None:
+    """Write clouds in rows of one length, all on one scale of colours, as a PNG."""
+    columns = len(rows[0])
+    figure = Figure(figsize=(3.6 * columns, 4.2 * len(rows) + 0.4), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(rows), columns, squeeze=False)
+    figure.suptitle(title, fontsize=9, parse_math=False)
+    panels = [panel for row in rows for panel in row]
+    most = max(float(panel.affordance[panel.observation.movable].max()) for panel in panels)
+    images = [_draw(axes, panel, most) for axes, panel in zip(grid.flat, panels, strict=True)]
+    figure.colorbar(images[0], ax=grid.ravel().tolist(), shrink=0.7, label="affordance (AAP)")
+    figure.savefig(out, format="png")
 
 
 def _project(points: Float, observation: Observation) -> Float:
@@ -71,15 +86,26 @@ def _project(points: Float, observation: Observation) -> Float:
     return np.stack([-seen[..., 1] / seen[..., 0], seen[..., 2] / seen[..., 0]], axis=-1)
 
 
-def _draw_cloud(axes: Axes, observation: Observation, affordance: Float32, most: float) -> PathCollection:
+def _draw(axes: Axes, panel: Panel, most: float) -> PathCollection:
     """Movable points coloured by affordance, the rest grey; what is nearer is drawn over what is farther."""
+    observation = panel.observation
     seen = _project(observation.points.astype(np.float64), observation)
     static = ~observation.movable
     axes.scatter(seen[static, 0], seen[static, 1], s=5, color=BODY_COLOUR, linewidths=0)
     movable = np.flatnonzero(observation.movable)
     image = axes.scatter(
-        seen[movable, 0], seen[movable, 1], c=affordance[movable], s=9, cmap=COLOURS, vmin=0, vmax=most, linewidths=0
+        seen[movable, 0],
+        seen[movable, 1],
+        c=panel.affordance[movable],
+        s=9,
+        cmap=COLOURS,
+        vmin=0,
+        vmax=most,
+        linewidths=0,
     )
+    if panel.tried is not None:
+        _draw_arrow(axes, panel.tried)
+    axes.set_title(panel.title, fontsize=9, parse_math=False)
     axes.set_aspect("equal")
     axes.set_axis_off()
     return image

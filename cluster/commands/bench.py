@@ -20,7 +20,7 @@ from shared.vocabulary import Primitive
 if TYPE_CHECKING:
     from shared.plan import Plan
 
-ACTIONS = ("fidelity", "dynamics", "collect", "store", "scale", "learner", "adapt")
+ACTIONS = ("fidelity", "dynamics", "collect", "store", "scale", "learner", "adapt", "hints")
 
 
 class BenchSettings(ObjectSelection):
@@ -122,6 +122,10 @@ def main(args: list[str]) -> int:
             from cluster.commands.bench_learner import adapt
 
             return adapt(args[1:])
+        case ["hints"]:
+            from cluster.commands.bench_hints import hints
+
+            return hints(args[1:])
         case ["-h" | "--help"]:
             print(f"usage: adaafford bench {{{','.join(ACTIONS)}}}; `adaafford bench fidelity --help` tells more")
             return 0
