@@ -86,9 +86,16 @@ def test_a_door_of_which_one_side_is_hardly_seen_is_left_out() -> None:
 
 
 def test_the_command_counts_tries_and_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    plan = Plan(setting=fabricate_setting(points=2048))
+    setting = fabricate_setting(points=2048)
+    plan = Plan(setting=setting.model_copy(update={"task": "push-faucet"}))
     store = make_store(tmp_path / "store", fabricate_rollouts(plan, Job(plan.key, 0, 6)), plan)
     flags = ["--store", str(store.path), "--policy", "push-faucet", "--picture", str(tmp_path / "hints.png")]
+    for bad, message in (
+        (["--policy", "pull-closed-door"], "a policy for 'pull-closed-door', but the store is of 'push-faucet'"),
+        (["--picture", str(tmp_path / "nowhere" / "hints.png")], "its folder is not there"),
+    ):
+        assert run(["bench", "hints", *flags, *bad]) == 2
+        assert message in capsys.readouterr().err.splitlines()[-1]
     assert run(["bench", "hints", *flags, "--json"]) == 0
     printed = capsys.readouterr().out
     cases = json.loads(printed.splitlines()[-1])["cases"]

@@ -65,10 +65,17 @@ class HintBenchmark:
         store: random interactions.
         policy: whose AAP.
         seen: content hashes of objects that it has learnt from; these are left out.
+
+    Raises:
+        UsageError: the policy has no AAP, or is of another task.
     """
 
     def __init__(self, store: Store, policy: Policy, seen: frozenset[str]) -> None:
         policy.require("aap")
+        if policy.task != store.setting.task:
+            raise UsageError(
+                f"a policy for '{policy.task}', but the store is of '{store.setting.task}'; use one of its task"
+            )
         self.hints: list[Hint] = []
         self._store, self._seen = store, seen
         self._adapter = Adapter(policy)

@@ -12,6 +12,7 @@ from cluster.cells import percent
 from cluster.commands.bench import finish
 from cluster.commands.bench_learner import StoredSettings, source_of, stored
 from cluster.settings import parse_flags
+from shared.errors import UsageError
 
 
 class HintsSettings(StoredSettings):
@@ -46,6 +47,8 @@ def hints(args: list[str]) -> int:
     from cluster.benchmarks.hinting import HintBenchmark, draw_hints
 
     policy = load_policy(command.policy)
+    if command.picture is not None and not command.picture.absolute().parent.is_dir():
+        raise UsageError(f"--picture {command.picture}: its folder is not there; make it, or name another")
     with stored(command) as store:
         benchmark = HintBenchmark(store, policy, seen_by(command.policy))
         with progress("shards of hints", benchmark.turns) as advance:
