@@ -124,7 +124,7 @@ def test_collect_times_what_users_run_and_the_published_protocol(
 @pytest.mark.parametrize(
     ("args", "expected"),
     [
-        (["fidelty"], "bench needs one of fidelity, dynamics, collect, store, scale, learner, adapt; given 'fidelty'"),
+        (["fidelty"], "store, scale, learner, adapt, hints; given 'fidelty'"),
         ([], "given nothing"),
         (["fidelity", "--task", "pusk"], "unknown task 'pusk'; allowed: push"),
         (["fidelity", "--trials", "0"], "trials"),
