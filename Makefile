@@ -20,8 +20,8 @@ $(STAMP): pyproject.toml constraints.txt
 run: $(STAMP)  ## Collect, train, collect again, evaluate: a small campaign, a few minutes on two cores.
 	$(BIN)/adaafford run --preset smoke --out runs/smoke
 
-test: $(STAMP)  ## The tests, without the slow ones and chaos.
-	$(BIN)/python -m pytest -q -m "not slow and not chaos"
+test: $(STAMP)  ## The tests, without the slow ones and chaos, in two processes.
+	$(BIN)/python -m pytest -q -m "not slow and not chaos" -n 2 --dist worksteal
 
 test-slow: $(STAMP)  ## The slow tests.
 	@# Pytest ends with 5 where it selects no test, which is no failure of a suite that may be empty.
