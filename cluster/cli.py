@@ -31,7 +31,7 @@ COMMANDS = {
     "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
     "store": "info, verify, digest, replay, repair, compact, merge or export: look after stores",
     "objects": "generate, check, preview or decompose: the objects",
-    "bench": "fidelity, dynamics, collect, store, scale, learner or adapt: measure how fast and how true each part is",
+    "bench": "fidelity, dynamics, collect, store, scale, learner, adapt or hints: how fast and how true each part is",
     "version": "print the version",
 }
 """Subcommands, each a module of `cluster.commands` with `main(args) -> int`."""
