@@ -6,6 +6,7 @@ from pathlib import Path
 from cluster.configuration import SplitConfig
 from cluster.selection import ObjectSelection
 from collector.catalogue import Catalogue, ObjectSplit, for_task, of_categories, read_list, scan, split
+from collector.files import short
 from collector.procedural.catalogue import CATEGORIES
 from collector.procedural.writing import generate
 from shared.categories import expanded
@@ -47,9 +48,18 @@ def objects_for(
 
 
 def built_in_categories(task: Task, categories: tuple[str, ...]) -> list[str]:
-    """The categories that built-in objects are made of: those that are named, or all, as far as the task applies."""
-    named = expanded(categories) or CATEGORIES
-    return [name for name in named if not task.categories or name in task.categories]
+    """The categories that built-in objects are made of: those that are named, or all, as far as the task applies.
+
+    Raises:
+        UsageError: an unknown category, or none of those that are named suits the task.
+    """
+    named = expanded(categories) or tuple(CATEGORIES)
+    allowed = [name for name in CATEGORIES if not task.categories or name in task.categories]
+    suited = [name for name in named if name in allowed]
+    wrong = next((name for name in named if name not in CATEGORIES), None if suited else named[0])
+    if wrong is not None:
+        raise UsageError(f"no built-in {short(wrong)} for the task '{task.name}'; allowed: {', '.join(allowed)}")
+    return suited
 
 
 def lists_of(splits: SplitConfig) -> tuple[Path, ...]:

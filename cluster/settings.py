@@ -1,11 +1,19 @@
 """From defaults, a preset, a file and flags to one validated model: later ones win, and every setting has a flag."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from types import GenericAlias
+from typing import Any, TypeVar, get_args
 
 import tyro
 from pydantic import BaseModel, ValidationError
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
 
 from shared.configuration import load_toml, merge, parse
 from shared.errors import UsageError
@@ -16,6 +24,31 @@ Model = TypeVar("Model", bound=BaseModel)
 Command = TypeVar("Command")
 
 FLAG_STYLE = (tyro.conf.AvoidSubcommands, tyro.conf.EnumChoicesFromValues)
+FLAG_TYPES = ConstructorRegistry()
+"""How the values of flags are read where tyro's own way is not ours."""
+
+
+@FLAG_TYPES.primitive_rule
+def _list_with_commas(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Let commas divide numbers and names from a choice, as spaces do (`--budgets 1,2,4`); paths may hold commas."""
+    kind, *rest = get_args(info.type) or (None,)
+    if info.type_origin is not tuple or rest != [Ellipsis]:
+        return None
+    as_list: Any = GenericAlias(list, (kind,))
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(as_list, info.markers))
+    if isinstance(spec, UnsupportedTypeAnnotationError):
+        return None
+    if spec.choices is None and PrimitiveTypeInfo.make(kind, info.markers).type is not int:
+        return None
+    choices = spec.choices
+
+    def read(args: list[str]) -> tuple[Any, ...]:
+        words = [word for arg in args for word in arg.split(",") if word]
+        if wrong := [word for word in words if choices is not None and word not in choices]:
+            raise ValueError(f"invalid choice {wrong[0][:80]!r}; allowed: {', '.join(choices or ())}")
+        return tuple(spec.instance_from_str(words))
+
+    return replace(spec, instance_from_str=read, is_instance=lambda given: isinstance(given, tuple), choices=None)
 
 
 def preset_names() -> list[str]:
@@ -68,7 +101,9 @@ def parse_flags(command: type[Command], args: list[str], prog: str, default: Com
         UsageError: a value is of the right type but not allowed.
     """
     try:
-        parsed = tyro.cli(command, prog=f"adaafford {prog}", args=args, default=default, config=FLAG_STYLE)
+        parsed = tyro.cli(
+            command, prog=f"adaafford {prog}", args=args, default=default, config=FLAG_STYLE, registry=FLAG_TYPES
+        )
     except ValidationError as error:
         problem = error.errors()[0]
         name = ".".join(str(part) for part in problem["loc"])

@@ -22,5 +22,6 @@ GROUPS = {"train": TRAIN_CATEGORIES, "test": TEST_CATEGORIES}
 
 
 def expanded(names: Iterable[str]) -> tuple[str, ...]:
-    """`names` with "train" and "test" replaced by the paper's categories, each once."""
-    return tuple(dict.fromkeys(category for name in names for category in GROUPS.get(name, (name,))))
+    """`names`, of which one may hold several with commas; "train" and "test" stand for the paper's; each once."""
+    single = (part for name in names for part in name.split(",") if part)
+    return tuple(dict.fromkeys(category for name in single for category in GROUPS.get(name, (name,))))

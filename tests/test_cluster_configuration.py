@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.configuration import EXECUTION_SETTINGS, CampaignConfig, RolloutCounts
+from cluster.evaluation_settings import EvaluateSettings
 from cluster.run_folder import begin, find
 from cluster.settings import difference, early_flags, layered, parse_flags, preset_names
 from shared.errors import UsageError
@@ -41,6 +42,31 @@ def test_early_flags_are_found_among_others() -> None:
         "preset": "smoke",
         "config": None,
     }
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    settings: Annotated[EvaluateSettings, tyro.conf.arg(name="")] = EvaluateSettings()
+    runs: tuple[Path, ...] = ()
+
+
+@pytest.mark.parametrize("budgets", [["1,2,4"], ["1", "2", "4"], ["1,2", "4"]])
+def test_lists_are_divided_by_commas_or_spaces(budgets: list[str]) -> None:
+    flags = ["--budgets", *budgets, "--methods", "where2act,ours-final", "--runs", "a,b", "c"]
+    parsed = parse_flags(Evaluation, flags, "evaluate", Evaluation())
+    assert parsed.settings.budgets == (1, 2, 4)
+    assert parsed.settings.methods == ("where2act", "ours-final")
+    assert parsed.runs == (Path("a,b"), Path("c"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"), [(["--budgets", "1,x"], "'x'"), (["--methods", "ours-final,hers"], "invalid choice 'hers'")]
+)
+def test_a_wrong_word_in_a_list_is_named(flags: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        parse_flags(Evaluation, flags, "evaluate", Evaluation())
+    assert stop.value.code == 2
+    assert expected in capsys.readouterr().err
 
 
 values = st.recursive(st.integers(0, 2), lambda inner: st.dictionaries(st.sampled_from("abc"), inner), max_leaves=6)

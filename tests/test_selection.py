@@ -51,6 +51,7 @@ def test_the_papers_categories_are_those_that_can_be_made() -> None:
     assert (len(TRAIN_CATEGORIES), len(TEST_CATEGORIES)) == (10, 5)
     assert {*TRAIN_CATEGORIES, *TEST_CATEGORIES} == set(procedural.CATEGORIES)
     assert expanded(["train", "Box", "Lamp"]) == (*TRAIN_CATEGORIES, "Lamp")
+    assert expanded(["Box,Lamp", "test"]) == ("Box", "Lamp", *TEST_CATEGORIES)
 
 
 def test_categories_and_lists_narrow_what_is_used(shelf: Path, tmp_path: Path) -> None:
@@ -71,6 +72,13 @@ def test_built_in_objects_are_made_of_the_categories_that_are_asked_for(tmp_path
     )
     assert [entry.ref.id for entry in catalogue.usable] == ["box-0000", "safe-0000"]
     assert folder == tmp_path / "made"
+
+
+@pytest.mark.parametrize(("task", "category"), [("push", "Lamp"), ("push-faucet", "Box")])
+def test_built_in_objects_of_no_use_are_refused_before_any_is_made(tmp_path: Path, task: str, category: str) -> None:
+    with pytest.raises(UsageError, match=rf"no built-in '{category}' for the task '{task}'; allowed: .*Faucet"):
+        objects_for(task_named(task), ObjectSelection(categories=(category,)), tmp_path / "made", 1, 0)
+    assert not (tmp_path / "made").exists()
 
 
 def test_lists_say_what_is_trained_and_tested_on(tmp_path: Path) -> None:
