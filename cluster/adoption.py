@@ -7,13 +7,16 @@ taught it, where there was one, and done.json, which says what objects it has se
 import json
 from pathlib import Path
 
-from adaafford.pretrained import load_policy
+from adaafford.pretrained import PRETRAINED_FOLDER, load_policy, pretrained_names
 from cluster.run_folder import RunFolder
 from learner.recipes import ORACLE_FILE
 from learner.stages import DONE_FILE, objects_seen
 from shared.errors import UsageError
 from shared.files import read_bounded, write_atomically
 from shared.policy import MAX_WEIGHTS_BYTES, Policy
+
+_DEPTH_IN_RUN = 3
+"""How far below its run a policy lies at most: RUN/store/policies/VERSION."""
 
 
 def adopt(source: str, task: str, out: Path) -> None:
@@ -43,9 +46,23 @@ def fit_to_start_from(source: str, task: str) -> Policy:
 
 
 def seen_by(source: str) -> frozenset[str]:
-    """Content hashes of the objects that a policy learned from or was judged by, as far as its place says."""
-    run = RunFolder(Path(source))
-    if not run.objects_file.is_file():
-        return objects_seen(run.path)
-    used = run.objects_used()
-    return frozenset(ref.content_hash for ref in (*used.train, *used.validation)) | objects_seen(run.adopted)
+    """Content hashes of the objects that a policy learned from or was judged by, as far as its place says.
+
+    Args:
+        source: as `load_policy` takes it. A run and all that lies in it, what a training stage left, what
+            `export-policy` wrote and what comes along say so; a lone copy of two files does not.
+    """
+    place = PRETRAINED_FOLDER / source if source in pretrained_names() else Path(source).absolute()
+    folder = place.parent if place.is_file() else place
+    known = objects_seen(folder)
+    for run in map(RunFolder, (folder, *folder.parents[:_DEPTH_IN_RUN])):
+        if run.objects_file.is_file():
+            used = run.objects_used()
+            known |= frozenset(ref.content_hash for ref in (*used.train, *used.validation)) | objects_seen(run.adopted)
+            break
+    return known
+
+
+def unknown(source: str) -> str:
+    """What to tell of a policy that `seen_by` knows nothing of."""
+    return f"'{source}' does not say what objects it has learned from; it may be tested on some of them"

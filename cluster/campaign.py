@@ -19,7 +19,7 @@ from typing import Any
 
 from rich.console import Console
 
-from cluster.adoption import fit_to_start_from, seen_by
+from cluster.adoption import fit_to_start_from, seen_by, unknown
 from cluster.collection import collect
 from cluster.configuration import CampaignConfig
 from cluster.evaluation import Evaluation, figures_of
@@ -125,6 +125,8 @@ class Campaign:
         if config.start_from is not None:
             fit_to_start_from(config.start_from, config.task)
             seen = seen_by(config.start_from)
+            if not seen:
+                self._console.print(f"start_from {unknown(config.start_from)}")
             parts = replace(parts, test=tuple(ref for ref in parts.test if ref.content_hash not in seen))
         if not parts.train or not parts.test:
             raise UsageError(

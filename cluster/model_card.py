@@ -1,13 +1,15 @@
 """Model cards: what a policy was trained on, how well it does, and what it is not for; Markdown beside its weights."""
 
+import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from cluster.adoption import seen_by
 from cluster.evaluation_tables import MARKDOWN_FILE
 from cluster.run_folder import RunFolder
 from learner.alternation import trained_in
-from learner.stages import objects_seen, read_policy_folder
+from learner.stages import DONE_FILE, objects_seen, read_policy_folder
 from shared.configuration import CameraConfig
 from shared.errors import UsageError
 from shared.files import read_bounded
@@ -30,7 +32,8 @@ class Source:
         name: what it is called there.
         store: what it was trained on.
         objects: how many of the store's objects it saw, and for what.
-        seen: those that it learned from, or was judged by.
+        seen: those that it learned from, as far as they are the store's.
+        known: content hashes of all that it learned from or was judged by, also before it was fine-tuned.
         origin: what kind of objects.
         results: Markdown; a table, and what it is a table of.
     """
@@ -40,6 +43,7 @@ class Source:
     store: Store
     objects: str
     seen: tuple[ObjectRef, ...]
+    known: frozenset[str]
     origin: str
     results: str
 
@@ -64,6 +68,7 @@ def source_of_run(run: RunFolder, version: int | None) -> Source:
         store=store,
         objects=f"{len(used.train)} to learn from, {len(used.validation)} to validate, {len(used.test)} to test",
         seen=used.train,
+        known=seen_by(str(run.path)),
         origin=PROCEDURAL if Path(used.folder) == run.generated_objects.resolve() else "objects of a user's folder",
         results=_without_title(table) if table.is_file() else "This policy was not evaluated.",
     )
@@ -93,13 +98,16 @@ def source_of_training(training: Path, store: Store, results: Path | None, origi
         store=store,
         objects=f"{len(refs)} to learn from and to validate by",
         seen=refs,
+        known=seen,
         origin=origin,
         results="This policy was not evaluated." if results is None else _without_title(results),
     )
 
 
 def export(source: Source, licence: str) -> dict[str, bytes]:
-    """weights.safetensors in half precision, policy.json, and README.md, the card, by name.
+    """weights.safetensors in half precision, policy.json, README.md, the card, and done.json, by name.
+
+    The last says what objects the policy has seen, so that whoever fine-tunes it is not tested on them.
 
     The networks of the baselines stay behind: nobody but an evaluation asks for them.
     """
@@ -113,7 +121,8 @@ def export(source: Source, licence: str) -> dict[str, bytes]:
         _limits(camera),
         _use(policy),
     )
-    return {**files, CARD_FILE: ("\n\n".join(card) + "\n").encode()}
+    seen = {"stage": "exported", "objects": sorted(source.known)}
+    return {**files, CARD_FILE: ("\n\n".join(card) + "\n").encode(), DONE_FILE: json.dumps(seen).encode()}
 
 
 def _without_title(table: Path) -> str:

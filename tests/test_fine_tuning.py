@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from adaafford.pretrained import load_policy
 from cluster.adoption import adopt, seen_by
 from cluster.campaign import Campaign, Crew
 from cluster.cli import run as adaafford
@@ -14,6 +15,8 @@ from cluster.evaluation_of_run import evaluate_run
 from cluster.evaluation_settings import EvaluateSettings
 from cluster.run_folder import RunFolder
 from cluster.training import as_toml
+from collector.catalogue import scan
+from collector.procedural import generate
 from learner.stages import read_policy_folder
 from shared.plan import ObjectRef
 from shared.store import Store
@@ -41,6 +44,30 @@ def test_what_is_adopted_remembers_what_it_has_seen(source: RunFolder, tmp_path:
     seen = set(json.loads((tmp_path / "done.json").read_text())["objects"])
     assert seen == {ref.content_hash for ref in source.objects_used().train} == seen_by(str(source.path))
     assert read_policy_folder(tmp_path).trained >= {"prior", "aap", "aip"}
+
+
+def test_what_a_policy_has_seen_is_found_by_whatever_it_is_called(source: RunFolder, tmp_path: Path) -> None:
+    seen = seen_by(str(source.path))
+    assert adaafford(["export-policy", str(source.path), "--out", str(tmp_path / "exported")]) == 0
+    version = source.store / "policies" / "000001"
+    for place in (tmp_path / "exported", tmp_path / "exported" / "weights.safetensors", version):
+        load_policy(place)
+        assert seen_by(str(place)) == seen
+    (tmp_path / "exported" / "done.json").unlink()
+    assert not seen_by(str(tmp_path / "exported"))
+
+
+def test_the_policies_that_come_along_say_what_they_have_seen(tmp_path: Path) -> None:
+    made = {seed: tmp_path / str(seed) for seed in (1, 2)}
+    for seed, folder in made.items():
+        generate(folder, {"Faucet": 5}, seed)
+    contents = {seed: {entry.ref.content_hash for entry in scan(folder).usable} for seed, folder in made.items()}
+    # They were trained on, or judged by, 240 of the 300 faucets of seed 1.
+    seen = seen_by("push-faucet")
+    assert len(seen) == 240
+    assert seen & contents[1]
+    assert not seen & contents[2]
+    assert seen_by("pull-closed-door")
 
 
 def test_a_run_that_started_from_a_policy_is_not_evaluated_on_what_that_has_seen(
