@@ -15,7 +15,7 @@ from cluster.evaluation_tables import as_csv
 from learner.comparison import CurveRow
 from learner.curve import ProposalGain
 from learner.training import without_nan
-from shared.files import write_atomically
+from shared.files import make_folder, write_atomically
 
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, FIGURE_FILE = "curve.json", "curve.csv", "curve.md", "curve.png"
 CRITICS = {
@@ -53,8 +53,8 @@ class Curves:
 
 
 def write_curves(out: Path, curves: Curves) -> None:
-    """Write the four files; curve.json comes last."""
-    out.mkdir(parents=True, exist_ok=True)
+    """Write the four files; curve.json comes last. Raises as `make_folder` does."""
+    make_folder(out)
     rows = [without_nan(asdict(row)) for row in curves.rows]
     write_atomically(out / CSV_FILE, as_csv(rows).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(curves).encode())

@@ -26,7 +26,7 @@ from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD, ObjectCounts
 from learner.training import without_nan
 from shared.configuration import parse
 from shared.errors import UsageError
-from shared.files import write_atomically
+from shared.files import make_folder, write_atomically
 from shared.store import Store
 
 MARKDOWN_FILE, CSV_FILE, JSON_FILE, FIGURE_FILE = (f"comparison.{kind}" for kind in ("md", "csv", "json", "png"))
@@ -182,16 +182,15 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
 
 
 def _tested(run: RunFolder, evaluation: str | None) -> _Tested:
-    used = run.objects_used()
     if evaluation is None:
-        folder, objects = run.training("evaluate"), used.test
+        folder, objects = run.training("evaluate"), run.objects_used().test
     else:
         folder = _evaluation_called(run, evaluation)
         objects = Store.open(folder / "store").setting.objects
     path = folder / RESULTS_FILE
     if not path.is_file():
         raise UsageError(f"{folder}: holds no {RESULTS_FILE}; finish the run first")
-    return _Tested(parse(_Results, read_json(path), str(path)), used.are_novel(objects))
+    return _Tested(parse(_Results, read_json(path), str(path)), run.are_novel(objects))
 
 
 def _evaluation_called(run: RunFolder, begins: str) -> Path:
@@ -255,8 +254,8 @@ def _share_of(rows: Sequence[PooledRow], method: str) -> float:
 
 
 def write_comparison(out: Path, comparison: Comparison) -> None:
-    """Write the four files; comparison.json comes last."""
-    out.mkdir(parents=True, exist_ok=True)
+    """Write the four files; comparison.json comes last. Raises as `make_folder` does."""
+    make_folder(out)
     rows = [row.flat() for row in comparison.rows]
     write_atomically(out / CSV_FILE, as_csv(rows).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(comparison).encode())

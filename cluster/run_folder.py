@@ -40,10 +40,6 @@ class ObjectsUsed(StrictModel):
     refused: tuple[tuple[str, str], ...]
     """(id, reason)."""
 
-    def are_novel(self, tested: Iterable[ObjectRef]) -> bool:
-        """Whether objects are of categories that nothing was trained on."""
-        return {ref.category for ref in tested}.isdisjoint(ref.category for ref in (*self.train, *self.validation))
-
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
@@ -105,6 +101,12 @@ class RunFolder:
     def page(self) -> Path:
         """report.html."""
         return self.path / "report.html"
+
+    def are_novel(self, tested: Iterable[ObjectRef]) -> bool:
+        """Whether objects are of categories that nothing was trained on; of an adopted policy nobody knows."""
+        used = self.objects_used()
+        learned_from = (ref.category for ref in (*used.train, *used.validation))
+        return not self.adopted.is_dir() and {ref.category for ref in tested}.isdisjoint(learned_from)
 
     def training(self, stage: str) -> Path:
         """What a training stage leaves."""

@@ -195,12 +195,15 @@ class ProposalGain:
 
 @torch.no_grad()
 def proposal_gains(
-    known: FrozenFeatures, candidates: Candidates, frozen: FrozenAap, aip: Aip, before: Sequence[int] = (0, 1, 2)
+    known: FrozenFeatures, candidates: Candidates, frozen: FrozenAap, aip: Aip, most: int = 3
 ) -> list[ProposalGain]:
-    """Whether the AIP critic picks better tries than chance among the candidates that a rollout happens to have."""
+    """Whether the AIP critic picks better tries than chance among the candidates that a rollout happens to have.
+
+    For the first tries, of which there are `most`, as far as the candidates go.
+    """
     dataset, features = known.dataset, known.rows(aip.encoder)
     ordered, found = candidates.ordered, []
-    for number in before:
+    for number in range(min(most, candidates.count)):
         parts = [
             _gains_of(
                 dataset, frozen, aip, features, ordered.rows[place][ordered.valid[place]], candidates.count, number

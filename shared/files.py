@@ -52,6 +52,18 @@ def _write_all(descriptor: int, data: bytes) -> None:
         left = left[taken:]
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder for results, and those above it; one that is there will do.
+
+    Raises:
+        UsageError: something else has its name, or it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{path}: no folder can be made of this name ({error.strerror}); name another") from None
+
+
 def sync_folder(path: Path) -> None:
     """Force a folder's entries (creations, renames) to the disk."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)

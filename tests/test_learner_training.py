@@ -185,7 +185,9 @@ def test_the_curve_falls_where_tries_tell_and_greedy_beats_chance(coin_dataset: 
     ]
     assert rows["random", 1].bce < rows["random", 0].bce
     assert rows["random", 0].bce == rows["aip", 0].bce
-    first, second = proposal_gains(known, candidates, frozen, policy.aip, (0, 1))
+    first, second = proposal_gains(known, candidates, frozen, policy.aip, 2)
+    few = dataclasses.replace(candidates, count=1)
+    assert len(proposal_gains(known, few, frozen, policy.aip)) == 1
     assert all(gain.greedy >= max(gain.random, gain.aip) for gain in (first, second))
     assert first.random > 0
     assert second.loss < first.loss

@@ -130,6 +130,9 @@ def test_novel_categories_stand_beside_the_papers_figures_of_such(tmp_path: Path
         assert found.novel_categories == (trained_on == "Door")
         # The paper's F-score of ours-final after one try, on its novel and on its training categories.
         assert figure in as_markdown(found)
+    # What the policy that a run went on from was trained on, nobody knows.
+    (tmp_path / "Door" / "training" / "adopted").mkdir()
+    assert not pool([tmp_path / "Door"], None).novel_categories
 
 
 def test_evaluations_of_several_seeds_are_found_by_how_their_names_begin(
@@ -161,6 +164,7 @@ def test_what_cannot_be_pooled_is_said_in_a_line(
         ([str(runs[0][0]), "--evaluation", "real"], "no finished evaluation called 'real'; evaluate the run first"),
         ([str(runs[0][0]), str(tmp_path / "novel")], "only some of the runs were tested on novel categories"),
         ([], "name the folders"),
+        ([str(runs[0][0]), "--out", __file__], "no folder can be made of this name"),
         ([str(runs[0][0])] * 2, "each once"),
     ):
         assert adaafford(["compare", *arguments]) == 2

@@ -9,6 +9,7 @@ import tyro
 
 from cluster.settings import parse_flags
 from shared.errors import UsageError
+from shared.files import make_folder
 
 if TYPE_CHECKING:
     from cluster.curves import Curves
@@ -47,6 +48,12 @@ def main(args: list[str]) -> int:
         raise UsageError(f"--tries {command.tries}: give numbers from 0 to 64, such as 0 1 2 4")
     if not 1 <= command.draws <= 100:
         raise UsageError(f"--draws {command.draws}: give a number from 1 to 100")
+    if command.seed < 0:
+        raise UsageError(f"--seed {command.seed}: give a number of 0 or more")
+    if command.threads is not None and not 1 <= command.threads <= 1024:
+        raise UsageError(f"--threads {command.threads}: give a number from 1 to 1024")
+    if command.out is not None:
+        make_folder(command.out)
     curves = _judge(command, named_runs(command.runs))
     from cluster.curves import as_json, as_markdown, write_curves
 

@@ -240,7 +240,7 @@ def _curves(results: Results) -> Drawing:
 
 
 def _level(results: Results, method: str, measure: Measure) -> go.Scatter | None:
-    """A line at the mean of what a method without tries reaches at all budgets, which differ by draws alone."""
+    """A line at the mean of what a method without tries reaches at all budgets."""
     rows = [row for budget in results.budgets if (row := results.row(method, budget)) is not None]
     values = [value for row in rows if (value := row.value(measure)) is not None]
     if not values:

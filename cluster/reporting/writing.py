@@ -43,8 +43,7 @@ def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say
     policy = Policy.from_files(store.read_policy(store.policy_versions()[-1]))
     adapter, found = Adapter(policy), first_episodes(evaluation)
     say("drawing tables, curves and clouds")
-    used = run.objects_used()
-    novel = used.are_novel(used.test)
+    novel = run.are_novel(run.objects_used().test)
     results = read_results(run.training("evaluate") / RESULTS_FILE, config.task, novel_categories=novel)
     further = _further(run)
     sections = [
@@ -69,9 +68,9 @@ def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say
 
 def _further(run: RunFolder) -> list[tuple[str, Results]]:
     """What `adaafford evaluate` made of the run, by name, as far as it is finished."""
-    used, found = run.objects_used(), []
+    found = []
     for path in sorted(run.evaluations.glob(f"*/{RESULTS_FILE}"))[:MAX_FURTHER]:
-        novel = used.are_novel(Store.open(path.parent / "store").setting.objects)
+        novel = run.are_novel(Store.open(path.parent / "store").setting.objects)
         found.append((path.parent.name, read_results(path, novel_categories=novel)))
     return found
 
