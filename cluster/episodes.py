@@ -60,12 +60,11 @@ def episodes(evaluation: Store, method: MethodName) -> Iterator[Episode]:
         StoreError: a shard is damaged or foreign.
     """
     for part in evaluation.parts():
-        for rollout in evaluation.read_rollouts(part.manifest.shard_id):
-            if part.start <= rollout.index < part.stop:
-                own = [row for row in rollout.interactions if row.method == method]
-                tries = tuple(row for row in own if row.role is Role.CONTEXT)
-                if tries:
-                    yield Episode(rollout, tries, tuple(row for row in own if row.role is Role.EXPLOIT))
+        for rollout in evaluation.rollouts_of(part):
+            own = [row for row in rollout.interactions if row.method == method]
+            tries = tuple(row for row in own if row.role is Role.CONTEXT)
+            if tries:
+                yield Episode(rollout, tries, tuple(row for row in own if row.role is Role.EXPLOIT))
 
 
 def most_telling(found: list[Episode], adapter: Adapter) -> Episode | None:

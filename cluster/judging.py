@@ -52,7 +52,7 @@ def judge(store: Store, version: int, oracle: Path) -> Table:
         task=store.setting.task,
         seed=store.setting.seed,
         objects=len(tried),
-        rollouts=sum(shard.stop - shard.start for shard in store.committed()),
+        rollouts=sum(part.stop - part.start for part in store.parts()),
         policy_version=version,
         store_digest=store.digest(),
         contents={ref.id: ref.content_hash for ref in store.setting.objects if ref.id in tried},

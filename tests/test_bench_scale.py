@@ -105,6 +105,12 @@ def test_sizes_out_of_order_are_refused(capsys: pytest.CaptureFixture[str]) -> N
     assert "in order" in capsys.readouterr().err
 
 
+def test_a_figure_that_cannot_be_kept_is_refused_beforehand(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for figure in (tmp_path, tmp_path / "figure.foo", tmp_path / "nowhere" / "figure.png"):
+        assert run(["bench", "scale", "--figure", str(figure)]) == 2
+        assert f"--figure {figure}: " in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_the_benchmark_from_end_to_end(tmp_path: Path, template: Store, capsys: pytest.CaptureFixture[str]) -> None:
     sizes = ["--actors", "5", "120", "--processes", "2", "--shards", "10", "20", "--seconds", "1"]

@@ -64,6 +64,7 @@ def test_the_first_try_of_each_case_counts_and_its_sides_are_told_by_the_hinge()
     rows = (
         tried_at(door, 0.0, True),  # Between the sides.
         tried_at(door, -0.55, True, joint_twist=sliding),
+        tried_at(door, -0.55, True, proposer="aip"),
         tried_at(door, -0.55, True),
         tried_at(door, -0.58, True),
         tried_at(door, 0.58, False),
@@ -71,7 +72,7 @@ def test_the_first_try_of_each_case_counts_and_its_sides_are_told_by_the_hinge()
     )
     free, hinge = hints_of(dataclasses.replace(door, interactions=rows), warmer_to_the_right)
     assert (free.case, hinge.case) == ("success-free", "failure-hinge")
-    assert free.interaction.action is rows[2].action
+    assert free.interaction.action is rows[3].action
     for hint in (free, hinge):
         assert hint.before == pytest.approx({"free": 0.2, "hinge": 0.2})
         assert hint.after == pytest.approx({"free": 0.7, "hinge": 0.2})
@@ -91,8 +92,9 @@ def test_the_command_counts_tries_and_draws_them(tmp_path: Path, capsys: pytest.
     store = make_store(tmp_path / "store", fabricate_rollouts(plan, Job(plan.key, 0, 6)), plan)
     flags = ["--store", str(store.path), "--policy", "push-faucet", "--picture", str(tmp_path / "hints.png")]
     for bad, message in (
-        (["--policy", "pull-closed-door"], "a policy for 'pull-closed-door', but the store is of 'push-faucet'"),
+        (["--policy", "pull-closed-door"], "a policy for 'pull-closed-door', but the tries are of 'push-faucet'"),
         (["--picture", str(tmp_path / "nowhere" / "hints.png")], "its folder is not there"),
+        (["--picture", str(tmp_path)], "give the name of a PNG file"),
     ):
         assert run(["bench", "hints", *flags, *bad]) == 2
         assert message in capsys.readouterr().err.splitlines()[-1]
@@ -104,6 +106,14 @@ def test_the_command_counts_tries_and_draws_them(tmp_path: Path, capsys: pytest.
         assert 0 <= figures["free"]["brighter"] <= 1
         assert 0 <= figures["hinge"]["after"] <= 1
     assert (tmp_path / "hints.png").is_file() == ("success-free" in cases)
+
+
+def test_a_policy_of_another_task_is_refused_before_anything_is_tried(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cluster.commands.bench_hints.stored", lambda _: pytest.fail("a store was made"))
+    assert run(["bench", "hints", "--task", "push-faucet"]) == 2
+    assert "a policy for 'pull-closed-door', but the tries are of 'push-faucet'" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -30,6 +30,8 @@ OUTER, INNER = 0.8, 0.2
 """Where the free side begins and the hinge side ends, as shares of the way from the axis to the farthest point seen."""
 LEAST_POINTS = 5
 """Of each side; a door of which less is seen is left out."""
+RANDOM = "random"
+"""The proposer whose tries count: what a network proposed says as much of the network as of the door."""
 DRAWN = 4
 """Objects in a picture."""
 
@@ -67,24 +69,20 @@ class HintBenchmark:
         seen: content hashes of objects that it has learnt from; these are left out.
 
     Raises:
-        UsageError: the policy has no AAP, or is of another task.
+        UsageError: as `fit_for_hints`.
     """
 
     def __init__(self, store: Store, policy: Policy, seen: frozenset[str]) -> None:
-        policy.require("aap")
-        if policy.task != store.setting.task:
-            raise UsageError(
-                f"a policy for '{policy.task}', but the store is of '{store.setting.task}'; use one of its task"
-            )
+        fit_for_hints(policy, store.setting.task)
         self.hints: list[Hint] = []
         self._store, self._seen = store, seen
         self._adapter = Adapter(policy)
-        self._shards = [manifest.shard_id for manifest in store.committed()]
+        self._parts = store.parts()
 
     @property
     def turns(self) -> int:
         """How often `run` will call `advance`."""
-        return len(self._shards)
+        return len(self._parts)
 
     def run(self, advance: Advance) -> None:
         """Take the first try of each case in every rollout.
@@ -92,14 +90,14 @@ class HintBenchmark:
         Raises:
             UsageError: there is no such try on a hinge.
         """
-        for shard_id in self._shards:
-            for rollout in self._store.read_rollouts(shard_id):
+        for part in self._parts:
+            for rollout in self._store.rollouts_of(part):
                 if rollout.object.content_hash not in self._seen:
                     self.hints += hints_of(rollout, self._adapter.affordance)
             advance()
         if not self.hints:
             raise UsageError(
-                f"{self._store.where}: holds no try on a hinged part that was not trained on; collect some"
+                f"{self._store.where}: holds no random try on a hinged part that was not trained on; collect some"
             )
 
     def as_json(self) -> dict[str, Any]:
@@ -108,17 +106,28 @@ class HintBenchmark:
         return {"cases": {case: _figures(hints) for case, hints in by_case.items() if hints}}
 
 
+def fit_for_hints(policy: Policy, task: str) -> None:
+    """Refuse a policy that cannot be asked about tries of a task.
+
+    Raises:
+        UsageError: it has no AAP, or is of another task.
+    """
+    policy.require("aap")
+    if policy.task != task:
+        raise UsageError(f"a policy for '{policy.task}', but the tries are of '{task}'; use one of its task")
+
+
 def hints_of(rollout: RolloutRecord, affordance: Callable[..., Float32]) -> list[Hint]:
-    """The first try of each case, so that long rollouts count no more than short ones.
+    """The first random try of each case, so that long rollouts count no more than short ones.
 
     Args:
-        rollout: random interactions.
+        rollout: interactions, of which those that a network proposed are passed over.
         affordance: of an observation after a history, [N], as `Adapter.affordance` has it.
     """
     found: dict[str, Hint] = {}
     for row in rollout.interactions:
         observation = rollout.observations[row.observation]
-        touched = _touched(observation, row)
+        touched = _touched(observation, row) if row.proposer == RANDOM else None
         if touched is None or (case := case_of(row.outcome, touched.side)) in found:
             continue
         tried = Interaction(observation, row.action, row.outcome)

@@ -97,6 +97,20 @@ class CollectCommand:
     settings: Annotated[CollectSettings, tyro.conf.arg(name="")] = CollectSettings()
 
 
+def check_picture(flag: str, path: Path | None) -> None:
+    """Refuse a picture that could not be kept, before the work that it shows.
+
+    Raises:
+        UsageError: it is no PNG, its folder is not there, or a folder has its name.
+    """
+    if path is None:
+        return
+    if path.suffix.lower() != ".png" or path.is_dir():
+        raise UsageError(f"{flag} {path}: give the name of a PNG file")
+    if not path.absolute().parent.is_dir():
+        raise UsageError(f"{flag} {path}: its folder is not there; make it, or name another")
+
+
 def main(args: list[str]) -> int:
     """Dispatch."""
     match args[:1]:

@@ -1,5 +1,6 @@
 """`adaafford bench hints`: what one try does to the heatmap of a hinged door."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,10 +10,9 @@ from pydantic import Field
 
 from cluster.benchmarks.progress import progress
 from cluster.cells import percent
-from cluster.commands.bench import finish
+from cluster.commands.bench import check_picture, finish
 from cluster.commands.bench_learner import StoredSettings, source_of, stored
 from cluster.settings import parse_flags
-from shared.errors import UsageError
 
 
 class HintsSettings(StoredSettings):
@@ -43,21 +43,25 @@ def hints(args: list[str]) -> int:
     """`adaafford bench hints`."""
     command = parse_flags(HintsCommand, args, "bench hints").settings
     from adaafford.pretrained import load_policy
-    from cluster.adoption import seen_by
-    from cluster.benchmarks.hinting import HintBenchmark, draw_hints
+    from cluster.adoption import seen_by, unknown
+    from cluster.benchmarks.hinting import HintBenchmark, draw_hints, fit_for_hints
 
     policy = load_policy(command.policy)
-    if command.picture is not None and not command.picture.absolute().parent.is_dir():
-        raise UsageError(f"--picture {command.picture}: its folder is not there; make it, or name another")
+    check_picture("--picture", command.picture)
+    if command.store is None:
+        fit_for_hints(policy, command.task)
+    if not (seen := seen_by(command.policy)):
+        print(f"--policy {unknown(command.policy)}", file=sys.stderr)
     with stored(command) as store:
-        benchmark = HintBenchmark(store, policy, seen_by(command.policy))
+        benchmark = HintBenchmark(store, policy, seen)
         with progress("shards of hints", benchmark.turns) as advance:
             benchmark.run(advance)
         result = benchmark.as_json() | source_of(command, store) | {"policy": command.policy}
     _print(result)
+    code = finish(command, "hints", result)
     if command.picture is not None and draw_hints(benchmark.hints, policy.task, command.picture):
-        print(f"drawn in {command.picture}")
-    return finish(command, "hints", result)
+        print(f"drawn in {command.picture}", file=sys.stderr)
+    return code
 
 
 def _print(result: dict[str, Any]) -> None:

@@ -32,11 +32,16 @@ class StoredSettings(BenchSettings):
     """Of the store that is made."""
     threads: int | None = Field(None, ge=1, le=1024)
     """Of PyTorch; unset: as many as it chooses."""
+
+
+class RepeatedSettings(StoredSettings):
+    """Of those that time something several times."""
+
     repeats: int = Field(5, ge=1, le=1000)
     """The median of these counts."""
 
 
-class LearnerSettings(StoredSettings):
+class LearnerSettings(RepeatedSettings):
     """Of `adaafford bench learner`."""
 
     steps: int = Field(10, ge=1, le=100_000)
@@ -45,7 +50,7 @@ class LearnerSettings(StoredSettings):
     """Of the published step in each repeat, seconds each."""
 
 
-class AdaptSettings(StoredSettings):
+class AdaptSettings(RepeatedSettings):
     """Of `adaafford bench adapt`."""
 
 

@@ -1,6 +1,7 @@
 """`adaafford bench scale`: what actors and shards cost the driver, and what many more would."""
 
 import json
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,7 +11,7 @@ import tyro
 from pydantic import Field
 
 from cluster.benchmarks.progress import progress
-from cluster.commands.bench import finish
+from cluster.commands.bench import check_picture, finish
 from cluster.commands.bench_learner import StoredSettings, source_of, stored
 from cluster.settings import parse_flags
 from shared.errors import UsageError
@@ -55,6 +56,7 @@ def scale(args: list[str]) -> int:
     command = parse_flags(ScaleCommand, args, "bench scale").settings
     if list(command.shards) != sorted(set(command.shards)):
         raise UsageError(f"--shards {' '.join(map(str, command.shards))}: give them in order, each once")
+    check_picture("--figure", command.figure)
     from cluster.benchmarks import scaling
     from cluster.benchmarks.listing import ListingBenchmark
 
@@ -77,13 +79,14 @@ def scale(args: list[str]) -> int:
         listing.points,
         scaling.Wish(command.predict_actors, command.predict_interactions, rollout, command.interactions_per_s),
     )
+    _print(result)
+    code = finish(command, "scale", result)
     if command.figure is not None:
         from cluster.benchmarks.scaling_figure import draw
 
         draw(result, before, command.figure)
-        print(f"drawn in {command.figure}")
-    _print(result)
-    return finish(command, "scale", result)
+        print(f"drawn in {command.figure}", file=sys.stderr)
+    return code
 
 
 def _read(path: Path | None) -> dict[str, Any] | None:

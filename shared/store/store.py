@@ -192,6 +192,11 @@ class Store:
         parts = parts_of(reader.read_manifests(reader.committed_shards(self.place, plan_key)))
         return parts if self._snapshot is None else self._snapshot.limit(parts)
 
+    def rollouts_of(self, part: Part) -> list[RolloutRecord]:
+        """The rollouts of a shard that count, in order; raises as `read_rollouts` does."""
+        rollouts = self.read_rollouts(part.manifest.shard_id)
+        return [rollout for rollout in rollouts if part.start <= rollout.index < part.stop]
+
     def tables_of(self, part: Part) -> tuple[Any, Any]:
         """The rollouts and the interactions of a shard that count, as tables.
 
