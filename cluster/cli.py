@@ -21,7 +21,7 @@ COMMANDS = {
     "resume": "go on with a run that was stopped",
     "evaluate": "the table of the paper: F-score and sample-success of all methods, on any objects",
     "compare": "the runs of several seeds as one table, beside the paper's figures",
-    "report": "print a run's results again",
+    "report": "print a run's results again, and draw its page anew",
     "adapt": "propose the next try on a scanned object, and say where it can be moved",
     "export-policy": "a run's policy in half precision with its model card, to take elsewhere",
     "collect": "collect interactions into a store, without any learning",

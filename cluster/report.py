@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from cluster.cells import number
 from cluster.configuration import CampaignConfig
 from cluster.evaluation_tables import RESULTS_FILE
 from cluster.figures import collection_figures
@@ -146,6 +147,4 @@ def _shown(path: Path) -> str:
 
 
 def _cell(value: Any) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
+    return value if isinstance(value, str) else number(value)
