@@ -159,8 +159,15 @@ def read_history(path: Path) -> History:
 
 
 def write_history(path: Path, history: History) -> None:
-    """Write a history; a reader finds the old one or the new."""
-    write_atomically(path, history.model_dump_json(indent=2).encode() + b"\n")
+    """Write a history; a reader finds the old one or the new.
+
+    Raises:
+        UsageError: its folder cannot be written to.
+    """
+    try:
+        write_atomically(path, history.model_dump_json(indent=2).encode() + b"\n")
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written ({error.strerror}); name another place") from None
 
 
 def _rounded(vector: list[float]) -> Vector:

@@ -10,6 +10,7 @@ Shapes: M points of a scan, N points that are kept of it.
 """
 
 import io
+import os
 import warnings
 import zipfile
 import zlib
@@ -24,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from adaafford.pcd import read_pcd
 from shared import seeds
-from shared.configuration import CameraConfig, StrictModel
+from shared.configuration import CameraConfig, StrictModel, parse
 from shared.errors import UsageError
 from shared.files import read_bounded
 from shared.geometry import camera_pose, gripper_rotation
@@ -46,6 +47,8 @@ UNREADABLE: tuple[type[Exception], ...] = (
 )
 """What parsers raise when bytes are not what they pretend to be."""
 _NORMAL_NEIGHBOURS = 16
+_LINE_ENDS = (*b"\n\r\x0b\x0c\x1c\x1d\x1e\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")
+"""What `str.splitlines` takes for the end of a line, as bytes."""
 
 MAX_COORDINATE = 1e4
 """Of places, metres, and of the numbers of a normal."""
@@ -89,10 +92,15 @@ class ScanFrame(StrictModel):
 
     @classmethod
     def around(cls, scan: Scan, up: Vector = (0.0, 0.0, 1.0), camera: Vector | None = None) -> "ScanFrame":
-        """The frame of a first scan: the object's middle is that of its bounding box, as in training."""
+        """The frame of a first scan: the object's middle is that of its bounding box, as in training.
+
+        Raises:
+            UsageError: `up` is no direction, or a number is not finite or too large.
+        """
         low, high = scan.points.min(axis=0), scan.points.max(axis=0)
         origin = tuple(float(value) for value in (low + high) / 2)
-        return cls(up=up, camera=camera or scan.camera or (0.0, 0.0, 0.0), origin=origin)
+        told = {"up": up, "camera": camera or scan.camera or (0.0, 0.0, 0.0), "origin": origin}
+        return parse(cls, told, "the frame of the scans")
 
     @property
     def world_from_scan(self) -> Float:
@@ -148,7 +156,7 @@ def read_scan_file(path: Path) -> bytes:
     """The bytes of a cloud's file; raises as `read_scan` does."""
     if path.suffix.lower() not in FORMATS:
         raise UsageError(f"{path}: not a kind of cloud that is read; allowed: {', '.join(FORMATS)}")
-    if not path.exists():
+    if not os.path.exists(path):  # noqa: PTH110 - a name too long for the disk is one that is not there.
         raise UsageError(f"{path}: there is no such file; name a cloud ({', '.join(FORMATS)})")
     return read_bounded(path.resolve(), MAX_SCAN_BYTES)
 
@@ -290,7 +298,8 @@ def _from_ply(data: bytes) -> dict[str, NDArray[np.generic]]:
     from trimesh.exchange.ply import load_ply
 
     # In text every line becomes an object of its own, whatever the header announces.
-    if b"ascii" in data[:100] and data.count(b"\n") > 2 * MAX_POINTS:
+    is_text = b"ascii" in b"".join(data.split(b"\n", 2)[1:2]).lower()
+    if is_text and sum(map(data.count, _LINE_ENDS)) - data.count(b"\r\n") > 2 * MAX_POINTS:
         raise ValueError("holds too many lines")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy warns of words among the numbers; what is wrong shows below.

@@ -127,6 +127,8 @@ class Session:
             history = history.concluding(outcome)
         known = history.interactions_with(lambda each: self._observe(each.cloud, each.cloud_sha256, history.frame)[0])
         observation, sha256 = self._observe(name, None, history.frame)
+        told = {each.cloud_sha256 for each in history.interactions} | {sha256}
+        self._observations = {key: value for key, value in self._observations.items() if key in told}
         rng = seeds.generator(self._seed, PURPOSE, len(known))
         action = AipProposer(self._adapter, rng, self._budget).propose(observation, known)
         do: Literal["try", "act"] = "act" if action is None else "try"

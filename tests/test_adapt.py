@@ -20,6 +20,7 @@ from adaafford.pretrained import PRETRAINED_FOLDER, load_policy, only_pretrained
 from adaafford.scans import ScanFrame, action_at, checked_scan, observation_of, read_scan
 from adaafford.sessions import Session, SessionFiles, Step
 from cluster.cli import run as adaafford
+from cluster.commands.adapt import MAX_LINE_BYTES, lines_of
 from shared.adaptation import Adapter, frames_in_view
 from shared.errors import AdaAffordError, StoreError, UsageError
 from shared.geometry import camera_pose, gripper_rotation, points_in_view
@@ -232,6 +233,27 @@ def test_a_hostile_cloud_is_refused_in_one_line(name: str, tmp_path: Path) -> No
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("end", ["\n", "\r", "\x0b", "\x85", "\u2028"])
+@pytest.mark.parametrize("name", [b"ascii", b"ASCII", b"   Ascii"])
+def test_a_text_of_too_many_lines_is_refused_unread(
+    name: bytes, end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("adaafford.scans.MAX_POINTS", 100)
+    whole = ply(front(99)).replace(b"format ascii", b"format " + name)
+    (tmp_path / "fits.ply").write_bytes(whole)
+    assert len(read_scan(tmp_path / "fits.ply").points) == 99
+    (tmp_path / "long.ply").write_bytes(whole + f"0{end}".encode() * 200)
+    with pytest.raises(UsageError, match="too many lines"):
+        read_scan(tmp_path / "long.ply")
+
+
+def test_lines_that_are_too_long_are_one_line_each() -> None:
+    long = b"x" * (3 * MAX_LINE_BYTES)
+    found = list(lines_of(io.BytesIO(long + b"\n{}\n" + long)))
+    assert [line[:3] for line in found] == [b"xxx", b"{}\n", b"xxx"]
+    assert [len(line) >= MAX_LINE_BYTES for line in found] == [True, False, True]
+
+
 @settings(max_examples=60, deadline=None)
 @given(kind=st.sampled_from(["ply", "pcd", "npz"]), place=st.integers(0, 400), byte=st.integers(0, 255))
 def test_a_flipped_byte_is_read_or_refused(
@@ -381,7 +403,7 @@ def test_an_exported_policy_has_a_card_and_adapts(tmp_path: Path, scan: Path) ->
     out = tmp_path / "exported"
     for _ in range(2):
         assert adaafford(["export-policy", str(run.path), "--out", str(out)]) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["README.md", POLICY_FILE, WEIGHTS_FILE]
+    assert sorted(path.name for path in out.iterdir()) == ["README.md", "done.json", POLICY_FILE, WEIGHTS_FILE]
     card = (out / "README.md").read_text()
     for word in (
         "push-faucet",
@@ -478,7 +500,33 @@ def test_misuse_is_refused_and_changes_nothing(policy_folder: Path, scan: Path, 
     np.savez(tmp_path / "elsewhere.npz", points=front())
     with pytest.raises(UsageError, match="does not lie beside the history"):
         session(policy_folder, scan).step(tmp_path / "elsewhere.npz")
+    with pytest.raises(UsageError, match="there is no such file"):
+        session(policy_folder, scan).step(scan.parent / f"{'x' * 300}.npz")
     assert (scan.parent / "history.json").read_bytes() == before
+
+
+def test_a_frame_that_is_none_is_refused_in_one_line(
+    policy_folder: Path, scan: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ["--cloud", str(scan), "--history", str(scan.parent / "history.json"), "--policy", str(policy_folder)]
+    for flags, expected in (
+        (["--up", "0", "0", "0"], "needs a direction, such as 0 0 1"),
+        (["--camera", "nan", "0", "0"], "nan"),
+        (["--camera", "1e9", "0", "0"], "less than or equal to 10000"),
+    ):
+        assert adaafford(["adapt", *where, *flags]) == 2
+        line = capsys.readouterr().err
+        assert expected in line
+        assert line.count("\n") == 1
+
+
+def test_a_long_session_forgets_scans_that_nothing_was_tried_on(policy_folder: Path, scan: Path) -> None:
+    lasting = session(policy_folder, scan)
+    for number in range(4):
+        again = scan.parent / f"again-{number}.npz"
+        np.savez(again, points=front() + 0.001 * number)
+        lasting.step(again)
+    assert len(lasting._observations) == 2  # The latest, and the one before, whose proposal it replaced.
 
 
 def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
@@ -508,12 +556,12 @@ def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
 def test_a_robot_may_follow_line_by_line(policy_folder: Path, scan: Path) -> None:
     command = [sys.executable, "-m", "cluster", "adapt", "--cloud", str(scan), "--policy", str(policy_folder)]
     command += ["--history", str(scan.parent / "history.json"), "--follow"]
-    lines = ['{"cloud": "scan.npz", "outcome": {"motion": 0.2}}', "nonsense", '{"cloud": "../x.npz"}']
-    done = subprocess.run(command, input="\n".join(lines) + "\n", capture_output=True, text=True, check=True)
+    lines = [b'{"cloud": "scan.npz", "outcome": {"motion": 0.2}}', b"nonsense", b'{"cloud": "../x.npz"}', b"\xff"]
+    done = subprocess.run(command, input=b"\n".join(lines) + b"\n", capture_output=True, check=True)
     first, second, *refused = [json.loads(line) for line in done.stdout.splitlines()]
     assert [first["tries"], second["tries"]] == [0, 1]
     assert second["seconds"] < 1
-    assert [list(each) for each in refused] == [["error"]] * 2
+    assert [list(each) for each in refused] == [["error"]] * 3
 
 
 def test_the_example_of_the_readme_runs(policy_folder: Path) -> None:

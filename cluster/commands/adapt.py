@@ -2,9 +2,10 @@
 
 import json
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 from cluster.settings import parse_flags
 from shared.errors import AdaAffordError, UsageError
@@ -85,13 +86,24 @@ def main(args: list[str]) -> int:
     return 0
 
 
+def lines_of(stream: BinaryIO) -> Iterator[bytes]:
+    """Lines as they come; of one that is too long only the first `MAX_LINE_BYTES` are kept."""
+    while line := stream.readline(MAX_LINE_BYTES):
+        rest = line
+        while len(rest) == MAX_LINE_BYTES and not rest.endswith(b"\n"):
+            rest = stream.readline(MAX_LINE_BYTES)
+        yield line
+
+
 def _follow(session: "Session", folder: Path) -> None:
     """Answer each line of the standard input by a line; one that cannot be answered, by its reason."""
     from adaafford.sessions import Request
 
-    while line := sys.stdin.readline(MAX_LINE_BYTES):
+    for line in lines_of(sys.stdin.buffer):
         try:
-            request = Request.read(line)
+            if len(line) >= MAX_LINE_BYTES:
+                raise UsageError(f"a line of more than {MAX_LINE_BYTES} bytes; " + 'write {"cloud": "scan.ply"}')
+            request = Request.read(line.decode(errors="replace"))
             print(session.step(folder / request.cloud, request.outcome).model_dump_json(), flush=True)
         except AdaAffordError as error:
             print(json.dumps({"error": str(error)}), flush=True)
