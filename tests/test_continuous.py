@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+import time
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -130,7 +131,12 @@ def test_rounds_are_the_same_whenever_they_are_stopped(store: Store, tmp_path: P
 
 
 def test_the_first_policy_is_waited_for(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
-    learner = threading.Timer(0.5, publish, (store, 1))
+    def publish_when_waited_for() -> None:
+        while (status := read_status(store.place)) is None or status.state != "waiting":
+            time.sleep(0.02)
+        publish(store, 1)
+
+    learner = threading.Thread(target=publish_when_waited_for, daemon=True)
     learner.start()
     fill(store, 2, Newest(), {})
     learner.join()
