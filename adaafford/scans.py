@@ -11,6 +11,7 @@ Shapes: M points of a scan, N points that are kept of it.
 
 import io
 import os
+import re
 import warnings
 import zipfile
 import zlib
@@ -43,12 +44,13 @@ MAX_OFF_CLOUD_M = 0.05
 FORMATS = (".ply", ".npz", ".pcd")
 UNREADABLE: tuple[type[Exception], ...] = (
     *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, MemoryError, OSError, EOFError),
-    *(RuntimeError, zipfile.BadZipFile, zlib.error),
+    *(RuntimeError, NameError, zipfile.BadZipFile, zlib.error),
 )
 """What parsers raise when bytes are not what they pretend to be."""
 _NORMAL_NEIGHBOURS = 16
 _LINE_ENDS = (*b"\n\r\x0b\x0c\x1c\x1d\x1e\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")
 """What `str.splitlines` takes for the end of a line, as bytes."""
+_MAX_HEADER_BYTES = 1 << 16
 
 MAX_COORDINATE = 1e4
 """Of places, metres, and of the numbers of a normal."""
@@ -297,8 +299,11 @@ def _facing(normals: Float, points: Float, camera: Float) -> Float:
 def _from_ply(data: bytes) -> dict[str, NDArray[np.generic]]:
     from trimesh.exchange.ply import load_ply
 
-    # In text every line becomes an object of its own, whatever the header announces.
-    is_text = b"ascii" in b"".join(data.split(b"\n", 2)[1:2]).lower()
+    # Every element that a header names becomes an object of its own, though it has no data.
+    if not re.search(rb"\nend_header\s", data[:_MAX_HEADER_BYTES]):
+        raise ValueError(f"has no header, or one of more than {_MAX_HEADER_BYTES} bytes")
+    # In text every line becomes one, whatever the header announces. Bytes would be lowered otherwise than the text is.
+    is_text = "ascii" in data.split(b"\n", 2)[1].decode(errors="replace").lower()
     if is_text and sum(map(data.count, _LINE_ENDS)) - data.count(b"\r\n") > 2 * MAX_POINTS:
         raise ValueError("holds too many lines")
     with warnings.catch_warnings():

@@ -5,6 +5,7 @@ history and the adapted affordance in a heatmap. A session that is ended and beg
 """
 
 import hashlib
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,8 +128,8 @@ class Session:
             history = history.concluding(outcome)
         known = history.interactions_with(lambda each: self._observe(each.cloud, each.cloud_sha256, history.frame)[0])
         observation, sha256 = self._observe(name, None, history.frame)
-        told = {each.cloud_sha256 for each in history.interactions} | {sha256}
-        self._observations = {key: value for key, value in self._observations.items() if key in told}
+        told = {id(each.observation) for each in known} | {id(observation)}
+        self._observations = {key: value for key, value in self._observations.items() if id(value) in told}
         rng = seeds.generator(self._seed, PURPOSE, len(known))
         action = AipProposer(self._adapter, rng, self._budget).propose(observation, known)
         do: Literal["try", "act"] = "act" if action is None else "try"
@@ -154,7 +155,7 @@ class Session:
 
     def _history(self, cloud: Path) -> History:
         """The history that is there, or a new one around a first scan."""
-        if self._files.history.exists():
+        if os.path.exists(self._files.history):  # noqa: PTH110 - pathlib raises where a name is too long.
             history = read_history(self._files.history)
             for name, given in (("up", self._up), ("camera", self._camera)):
                 kept = getattr(history.frame, name)
@@ -170,9 +171,10 @@ class Session:
 
     def _name_of(self, cloud: Path) -> str:
         """How a history in its folder names the cloud."""
-        folder = self._files.history.parent.resolve()
+        folder = os.path.realpath(self._files.history.parent)
         try:
-            return cloud.resolve().relative_to(folder).as_posix()
+            # Of a loop of links pathlib would raise; reading refuses it.
+            return Path(os.path.realpath(cloud)).relative_to(folder).as_posix()
         except ValueError:
             raise UsageError(
                 f"{cloud}: does not lie beside the history or below; put it into {folder}, so that both stay together"

@@ -212,6 +212,8 @@ HOSTILE = {
     "huge.ply": ply(front(99), "binary_little_endian").replace(b"vertex 99", b"vertex 999999999999"),
     "words.ply": ply(front(99)).replace(b"0.9", b"zero"),
     "cut.ply": ply(front(99), "binary_little_endian")[:-8],
+    "elements.ply": ply(front(99)).replace(b"end_", b"".join(b"element e%d 0\n" % n for n in range(9999)) + b"end_"),
+    "hollow.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n",
     "faces.ply": b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nend_header\n3 0 1 2\n",
     "header.pcd": b"FIELDS x y z\n" * 2000,
     "huge.pcd": pcd(front(99), "binary").replace(b"POINTS 99", b"POINTS 99999999999"),
@@ -234,7 +236,7 @@ def test_a_hostile_cloud_is_refused_in_one_line(name: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("end", ["\n", "\r", "\x0b", "\x85", "\u2028"])
-@pytest.mark.parametrize("name", [b"ascii", b"ASCII", b"   Ascii"])
+@pytest.mark.parametrize("name", [b"ascii", b"ASCII", b"   Ascii", "asci\u0130".encode()])
 def test_a_text_of_too_many_lines_is_refused_unread(
     name: bytes, end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -475,6 +477,8 @@ def test_a_step_that_is_asked_for_again_is_the_same(policy_folder: Path, scan: P
     steps = [session(policy_folder, scan).step(scan) for _ in range(2)]
     assert without_time(steps[0]) == without_time(steps[1])
     assert len(read_history(scan.parent / "history.json").interactions) == 1
+    lost = session(policy_folder, scan).step(scan, TriedOutcome(motion=0.2))
+    assert without_time(session(policy_folder, scan).step(scan)) == without_time(lost)
 
 
 def test_files_carry_a_session_over_processes(policy_folder: Path, scan: Path, tmp_path: Path) -> None:
@@ -500,9 +504,21 @@ def test_misuse_is_refused_and_changes_nothing(policy_folder: Path, scan: Path, 
     np.savez(tmp_path / "elsewhere.npz", points=front())
     with pytest.raises(UsageError, match="does not lie beside the history"):
         session(policy_folder, scan).step(tmp_path / "elsewhere.npz")
-    with pytest.raises(UsageError, match="there is no such file"):
-        session(policy_folder, scan).step(scan.parent / f"{'x' * 300}.npz")
+    scan.with_name("loop.npz").symlink_to("loop.npz")
+    for name in (f"{'x' * 300}.npz", "loop.npz"):
+        with pytest.raises(UsageError, match="there is no such file"):
+            session(policy_folder, scan).step(scan.parent / name)
     assert (scan.parent / "history.json").read_bytes() == before
+
+
+def test_names_too_long_for_the_disk_are_refused(policy_folder: Path, scan: Path) -> None:
+    for length in (250, 300):  # The first is too long for the temporary file beside it alone.
+        files = SessionFiles(scan.with_name("h" * length), None)
+        with pytest.raises(UsageError, match="cannot be written"):
+            Session(load_policy(policy_folder), files).step(scan)
+    (scan.parent / "history.json").write_text(history_text(entry(cloud=f"{'x' * 300}.npz")))
+    with pytest.raises(UsageError, match="there is no such file"):
+        session(policy_folder, scan).step(scan)
 
 
 def test_a_frame_that_is_none_is_refused_in_one_line(
@@ -526,7 +542,19 @@ def test_a_long_session_forgets_scans_that_nothing_was_tried_on(policy_folder: P
         again = scan.parent / f"again-{number}.npz"
         np.savez(again, points=front() + 0.001 * number)
         lasting.step(again)
-    assert len(lasting._observations) == 2  # The latest, and the one before, whose proposal it replaced.
+    assert len(lasting._observations) == 1
+
+
+def test_what_was_tried_is_remembered_though_its_hash_was_left_out(policy_folder: Path, scan: Path) -> None:
+    (scan.parent / "history.json").write_text(history_text(entry()))
+    later = scan.with_name("later.npz")
+    np.savez(later, points=front(seed=2))
+    lasting = session(policy_folder, scan)
+    lasting.step(later)
+    before = dict(lasting._observations)
+    lasting.step(later)
+    assert len(before) == 2
+    assert all(lasting._observations[key] is observation for key, observation in before.items())
 
 
 def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
