@@ -9,13 +9,14 @@ from typing import TypeAlias
 
 import numpy as np
 
-with warnings.catch_warnings():
+from collector.articulation import Mesh
+from collector.libx11 import without_x11
+from shared.vocabulary import Float
+
+with warnings.catch_warnings(), without_x11():
     warnings.simplefilter("ignore")
     import sapien
     from sapien import physx
-
-from collector.articulation import Mesh
-from shared.vocabulary import Float
 
 Link: TypeAlias = physx.PhysxArticulationLinkComponent
 DENSITY = 1000.0

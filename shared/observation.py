@@ -4,14 +4,12 @@ Points are kept as float16 (about 0.5 mm at 1 unit), normals as three signed byt
 Shapes: N points; any leading shape will do.
 """
 
-import fpsample
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.vocabulary import Float, Float32
 
 NORMAL_STEPS = 127
-_FPS_TREE_HEIGHT = 5
 
 
 def furthest_first(points: Float | Float32, count: int, candidates: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -26,15 +24,15 @@ def furthest_first(points: Float | Float32, count: int, candidates: int, rng: np
     Returns:
         [count].
     """
+    # Here, because Numba takes a third of a second to import and only those who observe need it.
+    from shared.furthest_points import furthest_points
+
     chosen = np.arange(len(points))
     if len(points) > candidates:
         chosen = rng.choice(len(points), candidates, replace=False)
     elif len(points) < count:
         chosen = np.concatenate([chosen, rng.integers(len(points), size=count - len(points))])
-    order = fpsample.bucket_fps_kdline_sampling(
-        points[chosen].astype(np.float32), count, h=_FPS_TREE_HEIGHT, start_idx=0
-    )
-    kept: NDArray[np.int64] = chosen[order.astype(np.int64)]
+    kept: NDArray[np.int64] = chosen[furthest_points(points[chosen].astype(np.float32), count)]
     return kept
 
 
