@@ -11,7 +11,8 @@ from importlib import import_module
 from typing import NoReturn
 
 from cluster.logs import configure
-from shared.errors import AdaAffordError
+from shared.errors import AdaAffordError, UsageError
+from shared.extras import extra_of, missing_line, require
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as a shell has it."""
@@ -35,6 +36,19 @@ COMMANDS = {
     "version": "print the version",
 }
 """Subcommands, each a module of `cluster.commands` with `main(args) -> int`."""
+
+NEEDS = {
+    "run": ("collect", "report"),
+    "resume": ("collect", "report"),
+    "evaluate": ("collect",),
+    "compare": ("report",),
+    "report": ("report",),
+    "collect": ("collect",),
+    "curve": ("report",),
+    "objects": ("collect",),
+    "bench": ("collect",),
+}
+"""Extras without which a command would fail, perhaps after hours; what only some of its uses need is not among them."""
 
 RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate")
 
@@ -66,7 +80,15 @@ def run(args: list[str]) -> int:
         name = "version"
     if name not in COMMANDS:
         return _complain(f"unknown command '{name}'; allowed: {', '.join(COMMANDS)}", 2)
-    return guarded(lambda: import_module(f"cluster.commands.{name.replace('-', '_')}").main(rest), args)
+
+    def command() -> int:
+        if not {"-h", "--help"}.intersection(rest):
+            # Ray is needed by several workers alone, and asked for when they start.
+            require(f"adaafford {name}", *NEEDS.get(name, ()), without=("ray",))
+        code: int = import_module(f"cluster.commands.{name.replace('-', '_')}").main(rest)
+        return code
+
+    return guarded(command, args)
 
 
 def guarded(command: Callable[[], int], args: list[str]) -> int:
@@ -81,6 +103,10 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
         sys.stdout.flush()
     except AdaAffordError as error:
         return _complain(str(error), error.exit_code)
+    except ModuleNotFoundError as error:
+        if extra_of(error.name) is None:
+            raise
+        return _complain(missing_line(f"adaafford {args[0]} here", str(error.name)), UsageError.exit_code)
     except KeyboardInterrupt:
         return _interrupted(args)
     except BrokenPipeError:

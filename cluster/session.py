@@ -6,12 +6,12 @@ import signal
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from importlib.util import find_spec
 from typing import Any
 
 from cluster.fleet import Fleet, SerialFleet, WorkerFactory
 from collector.guard import Limits
 from shared.errors import UsageError, WorkerError
+from shared.extras import require_packages
 from shared.underway import Underway
 
 OBJECT_STORE_BYTES = 128 << 20
@@ -53,10 +53,10 @@ def fleets(workers: int, limits: Limits, address: str | None = None) -> Iterator
         def make(make_worker: WorkerFactory, underway: Underway) -> Fleet:
             nonlocal begun
             if workers == 0:
-                require_installed("sapien")
+                require_packages("collecting", "sapien")
                 return SerialFleet(make_worker)
             # On a cluster, it is the workers that need SAPIEN.
-            require_installed("ray", *(["sapien"] if address is None else []))
+            require_packages("collecting", "ray", *(["sapien"] if address is None else []))
             if not begun:
                 stack.enter_context(ray_session(workers, address))
                 begun = True
@@ -67,18 +67,6 @@ def fleets(workers: int, limits: Limits, address: str | None = None) -> Iterator
             return fleet
 
         yield make
-
-
-def require_installed(*packages: str) -> None:
-    """See that packages which only collection needs are there, as they need not be where a learner runs.
-
-    Raises:
-        UsageError: one is not.
-    """
-    missing = [name for name in packages if find_spec(name) is None]
-    if missing:
-        names = " and ".join(missing)
-        raise UsageError(f"collecting needs {names}, not installed here; install adaafford with all it depends on")
 
 
 @contextmanager

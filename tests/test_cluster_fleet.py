@@ -375,9 +375,9 @@ def test_collecting_says_what_is_not_installed(
     workers: int, missing: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     found = find_spec
-    monkeypatch.setattr("cluster.session.find_spec", lambda name: None if name == missing else found(name))
+    monkeypatch.setattr("shared.extras.find_spec", lambda name: None if name == missing else found(name))
     with (
         fleets(workers, LIMITS) as make,
-        pytest.raises(UsageError, match=f"needs {missing}, not installed here; install adaafford"),
+        pytest.raises(UsageError, match=rf"needs {missing}, not installed here: pip install 'adaafford\[collect\]'"),
     ):
         make(partial(FakeWorker, tmp_path / "now"), Underway(tmp_path / "underway"))

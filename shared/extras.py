@@ -1,0 +1,52 @@
+"""Packages that only some uses need: which extra of this project brings them, and one line where one is missing."""
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+
+from shared.errors import UsageError
+
+EXTRAS: Mapping[str, tuple[str, ...]] = {
+    "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
+    "report": ("matplotlib", "plotly", "jinja2"),
+}
+"""Extras of pyproject.toml, and the packages that each brings."""
+
+
+def require(purpose: str, *extras: str, without: tuple[str, ...] = ()) -> None:
+    """See that the packages of some extras are installed, before any work starts.
+
+    Args:
+        purpose: what needs them, as the subject of a sentence.
+        extras: names of `EXTRAS`.
+        without: packages of these that this use can do without.
+
+    Raises:
+        UsageError: one is not installed.
+    """
+    for extra in extras:
+        require_packages(purpose, *(name for name in EXTRAS[extra] if name not in without))
+
+
+def require_packages(purpose: str, *packages: str) -> None:
+    """See that packages are installed.
+
+    Raises:
+        UsageError: one is not.
+    """
+    missing = [name for name in packages if find_spec(name) is None]
+    if missing:
+        raise UsageError(missing_line(purpose, *missing))
+
+
+def missing_line(purpose: str, *packages: str) -> str:
+    """What to say where packages are not installed."""
+    extras = sorted({extra_of(name) for name in packages} - {None}, key=str)
+    names = " and ".join(filter(None, [", ".join(packages[:-1]), packages[-1]]))
+    how = f"pip install 'adaafford[{','.join(map(str, extras))}]'" if extras else f"pip install {' '.join(packages)}"
+    return f"{purpose} needs {names}, not installed here: {how}"
+
+
+def extra_of(package: str | None) -> str | None:
+    """The extra that brings a package, or a module of it; None for a package that no extra brings."""
+    top = (package or "").partition(".")[0]
+    return next((extra for extra, names in EXTRAS.items() if top in names), None)
