@@ -217,7 +217,8 @@ def note_places(run: RunFolder, config: CampaignConfig) -> None:
 def _write_places(run: RunFolder, settings: Mapping[str, Any]) -> None:
     found = {name: _setting(settings, name) for name in PLACE_SETTINGS}
     places = {name: place for name, place in found.items() if place is not None}
-    write_atomically(run.places, json.dumps(places, indent=1).encode())
+    if places:
+        write_atomically(run.places, json.dumps(places, indent=1).encode())
 
 
 def _without_places(settings: dict[str, Any]) -> dict[str, Any]:

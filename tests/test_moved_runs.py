@@ -67,7 +67,7 @@ def test_a_run_of_older_software_finds_its_objects_after_it_was_moved(tmp_path: 
     run = make_finished_run(tmp_path / "a")
     used = json.loads(run.objects_file.read_text()) | {"folder": str((run.path / "objects").resolve())}
     run.objects_file.write_text(json.dumps(used))
-    run.places.unlink()
+    assert not run.places.exists()
     run.path.rename(tmp_path / "b")
     moved, config = find(tmp_path / "b")
     assert moved.objects_folder() == (tmp_path / "b" / "objects").resolve()
@@ -145,9 +145,11 @@ def test_what_a_run_publishes_names_no_place(tmp_path: Path) -> None:
 
 
 def test_a_kill_before_the_configuration_was_written_leaves_a_folder_that_is_free(tmp_path: Path) -> None:
-    run = begin(tmp_path / "run", CampaignConfig())
+    config = CampaignConfig(objects=tmp_path)
+    run = begin(tmp_path / "run", config)
     run.config.unlink()
-    assert begin(run.path, CampaignConfig()) == run
+    assert run.places.exists()
+    assert begin(run.path, config) == run
 
 
 def test_what_a_policy_has_seen_is_known_through_a_link(tmp_path: Path) -> None:

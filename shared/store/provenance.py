@@ -23,6 +23,8 @@ from shared.store.place import Place
 
 _PACKAGES = ("adaafford", "numpy", "pyarrow", "zarr", "torch", "sapien", "ray", "embreex")
 
+_MAX_NOTE_BYTES = 1 << 12
+
 
 @cache
 def software_versions() -> dict[str, str]:
@@ -44,9 +46,21 @@ def process_provenance() -> dict[str, str]:
 
 def note_machine(place: Place) -> None:
     """Write down in a store which host this machine is; nothing depends on it, so it is no error if that fails."""
-    key = f"{STATUS_FOLDER}/machine-{machine_name()}.json"
     with suppress(StoreError, OSError):
-        place.create(key, json.dumps({"host": host_name()}).encode())
+        place.create(_key(machine_name()), json.dumps({"host": host_name()}).encode())
+
+
+def host_of(place: Place, process: str) -> str:
+    """The host of a process, by its `shared.files.process_name`; "" if the store does not know it."""
+    try:
+        found = json.loads(place.read(_key(process.partition("-")[0]), _MAX_NOTE_BYTES))["host"]
+    except (StoreError, ValueError, KeyError, TypeError, RecursionError):
+        return ""
+    return found if isinstance(found, str) else ""
+
+
+def _key(machine: str) -> str:
+    return f"{STATUS_FOLDER}/machine-{machine}.json"
 
 
 def changed_versions(before: Mapping[str, str], now: Mapping[str, str] | None = None) -> str:
