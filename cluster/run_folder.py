@@ -18,6 +18,7 @@ known by their content, so that they may move, too (`adaafford resume RUN --obje
 """
 
 import json
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -223,7 +224,12 @@ def _write_places(run: RunFolder, settings: Mapping[str, Any]) -> None:
 
 def _without_places(settings: dict[str, Any]) -> dict[str, Any]:
     names = {name: _setting(settings, name) for name in PLACE_SETTINGS}
-    short = {name: Path(place).name for name, place in names.items() if place is not None}
+    # With a dot before it, a path's last part is not taken for one of the names that the package brings.
+    short = {
+        name: f"./{Path(place).name}" if os.sep in place else place
+        for name, place in names.items()
+        if place is not None
+    }
     return _with_settings(settings, short | {"ray_address": None})
 
 

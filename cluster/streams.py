@@ -9,6 +9,7 @@ import errno
 import io
 import os
 import select
+import shutil
 import signal
 import sys
 from contextlib import suppress
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 STDIN, STDOUT, STDERR = 0, 1, 2
+MIN_COLUMNS, MAX_COLUMNS = 40, 1000
+"""Narrower help and tables could not be read, and laying them out may never end; wider ones are mostly blanks."""
 
 
 class Sink(io.RawIOBase):
@@ -79,6 +82,9 @@ class Streams:
         self._err = Sink(STDERR, closed=_open_where_closed(STDERR, os.O_WRONLY), stop_at_pipe=False)
         if sys.stdin is None:
             sys.stdin = open(STDIN, closefd=False)  # noqa: SIM115 - a descriptor, for as long as the process.
+        columns = shutil.get_terminal_size().columns
+        if columns < MIN_COLUMNS or "COLUMNS" in os.environ:
+            os.environ["COLUMNS"] = str(min(max(columns, MIN_COLUMNS), MAX_COLUMNS))
         sys.stdout = _text(self._out, sys.stdout, by_line=bool(os.environ.get("PYTHONUNBUFFERED")))
         sys.stderr = _text(self._err, sys.stderr, by_line=True)
 

@@ -141,7 +141,9 @@ def test_what_a_run_publishes_names_no_place(tmp_path: Path) -> None:
     assert find(run.path)[1] == config
     assert begin(run.path, config) == run
     run.places.unlink()
-    assert json.loads(text)["config"]["objects"] == "objects"
+    told = json.loads(text)["config"]
+    assert (told["objects"], told["splits"]["train_list"]) == ("./objects", "./train.txt")
+    assert told["start_from"] == f"./{tmp_path.name}", "no name of a policy that the package brings"
 
 
 def test_a_kill_before_the_configuration_was_written_leaves_a_folder_that_is_free(tmp_path: Path) -> None:
@@ -184,3 +186,21 @@ def test_the_working_folder_does_not_matter(elsewhere: RunFolder, monkeypatch: p
     run = begin(Path("relative"), config)
     monkeypatch.chdir("/")
     assert os.path.isabs(json.loads((elsewhere.path.parent / run.places).read_text())["objects"])  # noqa: PTH117
+
+
+@pytest.mark.slow
+def test_a_store_of_other_software_is_added_to_with_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    objects, store = tmp_path / "objects", tmp_path / "store"
+    generate(objects, {"Faucet": 1}, seed=1)
+    flags = ["--workers", "0", "--collection.camera.points", "64", "--collection.rollout.interactions", "1"]
+    command = ["collect", "--task", "push-faucet", "--objects", str(objects), "--store", str(store), *flags]
+    assert adaafford([*command, "--rollouts", "1"]) == 0
+    assert "other software:" not in capsys.readouterr().err
+    monkeypatch.setattr("shared.store.provenance.software_versions", lambda: {"numpy": "99.0"})
+    assert adaafford([*command, "--rollouts", "2"]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "other software:" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith(f"{store}: begun with other software: ")
+    assert "(now 99.0)" in lines[0]
