@@ -9,27 +9,64 @@ A robot's author implements `Environment` over a camera and an arm, and lets the
 >>> heat = adapter.affordance(robot.observe(), history)      # [N], where the part can be moved
 """
 
+from importlib import import_module
 from importlib.metadata import version
+from typing import TYPE_CHECKING
 
-from adaafford.pretrained import load_policy
-from adaafford.scans import ScanFrame, checked_scan, observation_of, read_scan
-from shared.adaptation import Adapter
-from shared.errors import AdaAffordError
-from shared.policy import Policy
-from shared.proposers import AipProposer, ExploitProposer
-from shared.store import Store
-from shared.vocabulary import (
-    Action,
-    Environment,
-    Interaction,
-    Observation,
-    Outcome,
-    OutcomeKind,
-    Proposer,
-)
+from adaafford.packages import require_own_packages
 
+require_own_packages()
 __version__ = version("adaafford")
-open_store = Store.open
+
+if TYPE_CHECKING:
+    from adaafford.pretrained import load_policy
+    from adaafford.scans import ScanFrame, checked_scan, observation_of, read_scan
+    from shared.adaptation import Adapter
+    from shared.errors import AdaAffordError
+    from shared.policy import Policy
+    from shared.proposers import AipProposer, ExploitProposer
+    from shared.store import Store
+    from shared.vocabulary import (
+        Action,
+        Environment,
+        Interaction,
+        Observation,
+        Outcome,
+        OutcomeKind,
+        Proposer,
+    )
+
+    open_store = Store.open
+else:
+    # Imported when it is first asked for: the command line begins here, too, and its help is not to wait for PyTorch.
+    _HOMES = {
+        "adaafford.pretrained": ("load_policy",),
+        "adaafford.scans": ("ScanFrame", "checked_scan", "observation_of", "read_scan"),
+        "shared.adaptation": ("Adapter",),
+        "shared.errors": ("AdaAffordError",),
+        "shared.policy": ("Policy",),
+        "shared.proposers": ("AipProposer", "ExploitProposer"),
+        "shared.store": ("Store",),
+        "shared.vocabulary": (
+            *("Action", "Environment", "Interaction", "Observation"),
+            *("Outcome", "OutcomeKind", "Proposer"),
+        ),
+    }
+
+    def __getattr__(name: str) -> object:
+        if name == "open_store":
+            found = __getattr__("Store").open
+        else:
+            home = next((home for home, names in _HOMES.items() if name in names), None)
+            if home is None:
+                raise AttributeError(f"module 'adaafford' has no attribute {name!r}")
+            found = getattr(import_module(home), name)
+        globals()[name] = found
+        return found
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})
+
 
 __all__ = [
     "Action",

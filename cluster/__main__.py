@@ -1,6 +1,6 @@
 """`python -m cluster`: the command line `adaafford`, for whoever starts processes (`torchrun -m cluster train ...`)."""
 
-from cluster.cli import main
+from adaafford.console import main
 
 if __name__ == "__main__":
     main()

@@ -52,7 +52,7 @@ def seen_by(source: str) -> frozenset[str]:
         source: as `load_policy` takes it. A run and all that lies in it, what a training stage left, what
             `export-policy` wrote and what comes along say so; a lone copy of two files does not.
     """
-    place = PRETRAINED_FOLDER / source if source in pretrained_names() else Path(source).absolute()
+    place = PRETRAINED_FOLDER / source if source in pretrained_names() else Path(source).resolve()
     folder = place.parent if place.is_file() else place
     known = objects_seen(folder)
     for run in map(RunFolder, (folder, *folder.parents[:_DEPTH_IN_RUN])):

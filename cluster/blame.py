@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from shared.errors import WorkerError
 from shared.plan import Job
+from shared.redaction import without_secrets
 
 MAX_FAULTS = 3
 """Attempts that a rollout may fail by itself: one for its own sake, two against bad luck of a machine."""
@@ -118,5 +119,6 @@ class Blame:
 
 def describe(error: BaseException) -> str:
     """An exception in one line of bounded length."""
-    text = "".join(letter for letter in " ".join(str(error).split()) if letter.isprintable())[:300]
+    said = without_secrets(" ".join(str(error).split()))
+    text = "".join(letter for letter in said if letter.isprintable())[:300]
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -36,6 +36,7 @@ from shared.files import write_atomically
 from shared.methods import baselines_of
 from shared.plan import Plan, Setting
 from shared.store import Store
+from shared.store.provenance import changed_versions, software_versions
 from shared.tasks import task_named
 
 
@@ -80,9 +81,13 @@ class Campaign:
         config = self._config
         with only_driver(self._run.path), closing(self._trainer):
             ledger = Ledger(self._run.log)
-            ledger.note("attempt", workers=config.workers)
+            ledger.note("attempt", workers=config.workers, software=software_versions())
             with fleets(config.workers, config.limits, config.ray_address) as make_fleet:
-                run_stages(self.stages(Crew(make_fleet)), ledger, self._say)
+                stages = self.stages(Crew(make_fleet))
+                changed = changed_versions(self._run.begun_with())
+                if changed and any(stage.name not in ledger.finished for stage in stages):
+                    self._say(f"begun with other software: {changed}; what is made from here on may differ by it")
+                run_stages(stages, ledger, self._say)
             from cluster.report import print_report
 
             print_report(self._run)
@@ -133,7 +138,7 @@ class Campaign:
                 f"{folder}: {len(catalogue.usable)} usable objects are too few to train on some and test on others"
             )
         used = ObjectsUsed(
-            folder=str(folder),
+            folder=folder.name,
             train=parts.train,
             validation=parts.validation,
             test=parts.test,
@@ -161,7 +166,7 @@ class Campaign:
 
     def _collect(self, crew: Crew, proposer: str, version: int, rollouts: int) -> Mapping[str, Any]:
         """One collection round."""
-        store, folder = Store.open(self._run.store), Path(self._run.objects_used().folder)
+        store, folder = Store.open(self._run.store), self._run.objects_folder()
         plan = Plan(setting=store.setting, proposer=proposer, policy_version=version)
         open_fleet = partial(crew.for_store, store, folder)
         with store.only_driver():
@@ -178,7 +183,7 @@ class Campaign:
             version=version,
             rollouts=rollouts.total(rollouts.evaluation, len(run.objects_used().test)),
             per_shard=rollouts.per_shard,
-            objects=Path(run.objects_used().folder),
+            objects=run.objects_folder(),
             oracle=run.oracle,
             out=run.training("evaluate"),
         )

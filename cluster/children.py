@@ -6,12 +6,13 @@ They die with this process, however that dies (`cluster.lifeline`).
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 
 from shared.errors import UsageError, WorkerError
+from shared.interpreter import PYTHON, own_environment
+from shared.redaction import without_places
 
 THREADS = 2
 """Of torch, in a child: the collectors rest while it works."""
@@ -33,10 +34,10 @@ class Child:
     """
 
     def __init__(self, module: str, arguments: Sequence[str] = (), *, told: bool = False) -> None:
-        wrapper = [sys.executable, "-m", "cluster.lifeline", str(os.getpid())]
+        wrapper = [*PYTHON, "-m", "cluster.lifeline", str(os.getpid())]
         # A session of its own: Ctrl-C reaches this process alone, which then ends the child in an orderly way.
         self._process = subprocess.Popen(
-            [*wrapper, sys.executable, "-m", module, *arguments],
+            [*wrapper, *PYTHON, "-m", module, *arguments],
             env=_environment(),
             stdin=subprocess.PIPE if told else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -53,13 +54,14 @@ class Child:
             self._process.stdin.write(f"{line}\n")
             self._process.stdin.flush()
 
-    def wait(self, out: Path, what: str, say: Callable[[str], None]) -> None:
+    def wait(self, out: Path, what: str, say: Callable[[str], None], root: Path | None = None) -> None:
         """Wait until it ends, or until it has done what it was told.
 
         Args:
-            out: folder that gets output.txt, everything that it printed.
+            out: folder that gets output.txt, everything that it printed, with paths relative to `root`.
             what: its command, for messages.
             say: is given each line as it comes.
+            root: the run's folder, which may be published or moved; `out` where none is given.
 
         Raises:
             UsageError: it refused its input; its own line is the message.
@@ -67,7 +69,7 @@ class Child:
         """
         out.mkdir(parents=True, exist_ok=True)
         with (out / OUTPUT_FILE).open("w", encoding="utf-8") as log:
-            last, code = self._relay(log.write, say)
+            last, code = self._relay(lambda line: log.write(without_places(line, root or out)), say)
         if code == UsageError.exit_code:
             raise UsageError(last.removeprefix("adaafford: "))
         if code != 0:
@@ -101,10 +103,12 @@ class Child:
         return last, self._process.wait()
 
 
-def run_child(module: str, arguments: Sequence[str], out: Path, say: Callable[[str], None]) -> None:
+def run_child(
+    module: str, arguments: Sequence[str], out: Path, say: Callable[[str], None], root: Path | None = None
+) -> None:
     """Run `python -m MODULE ARGUMENTS` and wait for its end; see `Child.wait`."""
     with closing(Child(module, arguments)) as child:
-        child.wait(out, f"python -m {module} {' '.join(arguments)}", say)
+        child.wait(out, f"python -m {module} {' '.join(arguments)}", say, root)
 
 
 class Learner:
@@ -116,13 +120,13 @@ class Learner:
     def __init__(self) -> None:
         self._child: Child | None = None
 
-    def train(self, arguments: Sequence[str], out: Path, say: Callable[[str], None]) -> None:
+    def train(self, arguments: Sequence[str], out: Path, say: Callable[[str], None], root: Path | None = None) -> None:
         """Run `adaafford train ARGUMENTS`; see `Child.wait`."""
         if self._child is None:
             self._child = Child("cluster.learning", told=True)
         try:
             self._child.tell(json.dumps(arguments))
-            self._child.wait(out, f"adaafford train {' '.join(arguments)}", say)
+            self._child.wait(out, f"adaafford train {' '.join(arguments)}", say, root)
         except BaseException:
             self.close()
             raise
@@ -136,4 +140,4 @@ class Learner:
 
 def _environment() -> dict[str, str]:
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(THREADS))
-    return {**os.environ, **threads, "PYTHONUNBUFFERED": "1"}
+    return {**own_environment(), **threads, "PYTHONUNBUFFERED": "1"}

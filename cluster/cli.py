@@ -3,16 +3,24 @@
 Heavy packages are imported by the subcommands that need them, so that help is instant.
 """
 
+import logging
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Callable
 from importlib import import_module
+from types import TracebackType
 from typing import NoReturn
 
+import adaafford  # noqa: F401 - it sees first that nothing shadows our packages.
 from cluster.logs import configure
+from cluster.streams import Streams
 from shared.errors import AdaAffordError, UsageError
 from shared.extras import extra_of, missing_line, require
+from shared.redaction import without_secrets
+
+logger = logging.getLogger(__name__)
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as a shell has it."""
@@ -51,6 +59,7 @@ NEEDS = {
 """Extras without which a command would fail, perhaps after hours; what only some of its uses need is not among them."""
 
 RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate")
+"""Long work, which goes on when nobody reads its output any more."""
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells more\n\n" + "\n".join(
     f"  {name:<15}{text}" for name, text in COMMANDS.items()
@@ -59,15 +68,29 @@ USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells 
 
 def main() -> NoReturn:
     """Run the command line of this process and exit."""
-    begin_process()
-    sys.exit(run(sys.argv[1:]))
+    args = sys.argv[1:]
+    streams = begin_process(stop_at_pipe=not args or args[0] not in RESUMABLE)
+    try:
+        code = run(args)
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else _complain(str(stop.code), 1) if stop.code else 0
+    sys.exit(streams.settle(code))
 
 
-def begin_process() -> None:
-    """Set up logging and signals of a process of ours."""
+def begin_process(*, stop_at_pipe: bool = False) -> Streams:
+    """Set up standard streams, logging and signals of a process of ours; returns the streams.
+
+    Args:
+        stop_at_pipe: see `Streams`.
+    """
+    streams = Streams(stop_at_pipe=stop_at_pipe)
     configure(os.environ)
-    # As Ctrl-C does, so that workers and learners are ended in an orderly way.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    sys.excepthook = _show_traceback
+    # As Ctrl-C does, so that workers and learners are ended in an orderly way; `nohup` has SIGHUP ignored.
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda received, _: sys.exit(128 + received))
+    return streams
 
 
 def run(args: list[str]) -> int:
@@ -110,9 +133,12 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
     except KeyboardInterrupt:
         return _interrupted(args)
     except BrokenPipeError:
-        # Whoever read our output has enough (`adaafford ... | head`); keep Python from complaining at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # Whoever read our output has enough (`adaafford ... | head`).
         return 128 + signal.SIGPIPE
+    except OSError as error:
+        logger.info("what the system refused", exc_info=True)
+        place = f"{error.filename}: " if error.filename else ""
+        return _complain(f"{place}{error.strerror or error}; see to this and run the same command again", 1)
     return code
 
 
@@ -120,7 +146,9 @@ def _interrupted(args: list[str]) -> int:
     """Say how to go on after Ctrl-C."""
     hint = "; what is committed stays, and the same command goes on" if args[0] in RESUMABLE else ""
     print(
-        f"adaafford: interrupted{hint}: adaafford {' '.join(args)}" if hint else "adaafford: interrupted",
+        f"adaafford: interrupted{hint}: adaafford {without_secrets(' '.join(args))}"
+        if hint
+        else "adaafford: interrupted",
         file=sys.stderr,
     )
     return INTERRUPTED
@@ -128,5 +156,10 @@ def _interrupted(args: list[str]) -> int:
 
 def _complain(message: str, code: int) -> int:
     """Print one line."""
-    print(f"adaafford: {' '.join(message.split())}", file=sys.stderr)
+    print(f"adaafford: {without_secrets(' '.join(message.split()))}", file=sys.stderr)
     return code
+
+
+def _show_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """As Python shows what is our own mistake, without secrets that its text may quote."""
+    print(without_secrets("".join(traceback.format_exception(kind, error, trace))), end="", file=sys.stderr)

@@ -17,6 +17,7 @@ from shared.files import process_name
 from shared.plan import Plan, covered, missing_ranges
 from shared.reproduction import reproduction
 from shared.store import Store
+from shared.store.info import quarantined_in
 
 OpenFleet = Callable[[], Fleet]
 
@@ -97,7 +98,7 @@ def collect(
             command = reproduction(store.where, error.job.shard_id, objects)
             raise WorkerError(f"{error}; reproduce it with: {command}") from None
     if progress.tally.quarantined:
-        _report_quarantined(store, plan)
+        _report_quarantined(store, plan, objects)
     return Collected(progress.tally, progress.elapsed_s, fleet.workers)
 
 
@@ -155,10 +156,10 @@ class _Standing:
         )
 
 
-def _report_quarantined(store: Store, plan: Plan | Newest) -> None:
+def _report_quarantined(store: Store, plan: Plan | Newest, objects: Path) -> None:
     """Say which rollouts were given up, why, and how to see it happen."""
     shards = (shard for key in _plan_keys(store, plan) for shard in store.committed(key))
-    given_up = [each for shard in shards for each in shard.quarantined]
+    given_up = quarantined_in(shards, store.where, objects)
     logger.warning("%d rollouts of %s are quarantined; `adaafford store info` lists them", len(given_up), plan.key)
     for each in given_up[:MOST_REPORTED]:
         logger.warning("rollout %d: %s; alone: %s", each.rollout, each.reason, each.command)

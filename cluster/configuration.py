@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pydantic import Field, field_validator, model_validator
 
-from cluster.selection import ObjectSelection
+from cluster.selection import ObjectSelection, RayAddress
 from collector.guard import Limits
 from learner.configuration import AapConfig, AdaptationConfig, AipConfig, InteractionConfig, PriorConfig
 from shared.configuration import CollectionConfig, StrictModel
@@ -110,7 +110,7 @@ class CampaignConfig(ObjectSelection):
     evaluation: EvaluationConfig = EvaluationConfig()
     workers: int = Field(2, ge=0, le=4096)
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""
-    ray_address: str | None = None
+    ray_address: RayAddress | None = None
     """Of a running Ray cluster; a private session on this machine where none is given."""
     rollout_limit_s: float = Field(300.0, gt=0)
     """A worker that takes longer for one rollout is taken for hung, and replaced; after three times the rollout is

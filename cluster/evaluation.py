@@ -72,7 +72,7 @@ class Evaluation:
             collected = collect(self.store, plan, self.rollouts, self.per_shard, open_fleet, self.objects)
             dismiss()
             arguments = [self.store.where, str(self.version), str(self.out), str(self.oracle)]
-            run_child("cluster.judging", arguments, self.out, say)
+            run_child("cluster.judging", arguments, self.out, say, Path(self.policies.where).parent)
         return collected
 
     def _publish(self) -> None:

@@ -2,7 +2,6 @@
 
 import hashlib
 import sys
-from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 
@@ -37,7 +36,7 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
     version = _version(run, policies, settings.policy)
     policy = Policy.from_files(policies.read_policy(version))
     task = _task(config, settings.task)
-    refs, folder = _objects(task, settings, used, seen_by(str(run.path)))
+    refs, folder = _objects(task, settings, run, used)
     setting = Setting(
         kind="evaluation",
         task=task.name,
@@ -50,7 +49,7 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
             queries=settings.queries,
         ),
     )
-    out = out if out is not None else run.evaluations / _name(setting, folder, version)
+    out = out if out is not None else _default_out(run, setting, folder, version)
     evaluation = Evaluation(
         store=Store.create(out / "store", setting),
         policies=policies,
@@ -103,27 +102,28 @@ def _task(config: CampaignConfig, name: str | None) -> Task:
 
 
 def _objects(
-    task: Task, settings: EvaluateSettings, used: ObjectsUsed, seen: Collection[str]
+    task: Task, settings: EvaluateSettings, run: RunFolder, used: ObjectsUsed
 ) -> tuple[tuple[ObjectRef, ...], Path]:
     """The run's test objects, or all of another folder that suit the task and were not trained on; and their folder.
 
     Args:
         task: what is evaluated.
         settings: may name another folder.
+        run: whose policy it is.
         used: by the run.
-        seen: content hashes of what was trained on, by the run or by the policy that it started from.
 
     Raises:
         UsageError: none is left.
     """
-    folder = Path(used.folder)
-    selection = settings if settings.objects is not None else settings.model_copy(update={"objects": folder})
-    catalogue, folder = objects_for(task, selection, folder, per_category=0, seed=0)
+    own = run.objects_folder() if settings.objects is None else settings.objects
+    selection = settings.model_copy(update={"objects": own})
+    catalogue, folder = objects_for(task, selection, own, per_category=0, seed=0)
     refs = {entry.ref for entry in catalogue.usable}
     if settings.objects is None:
         refs &= set(used.test)
     else:
         # By content: the same object may lie in two folders, under two names.
+        seen = seen_by(str(run.path))
         refs = {ref for ref in refs if ref.content_hash not in seen}
     if not refs:
         raise UsageError(f"{folder}: no object suits task '{task.name}' and was not trained on; name other objects")
@@ -135,7 +135,8 @@ def _possible_methods(policy: Policy) -> tuple[MethodName, ...]:
     return tuple(name for name, method in METHODS.items() if policy.trained.issuperset(method.modules))
 
 
-def _name(setting: Setting, folder: Path, version: int) -> str:
-    """A name that other settings do not share, and people can tell apart."""
+def _default_out(run: RunFolder, setting: Setting, folder: Path, version: int) -> Path:
+    """A folder that other settings do not share, and people can tell apart; the same after the objects have moved."""
     digest = hashlib.sha256(f"{version} {setting.model_dump_json()}".encode()).hexdigest()
-    return f"{setting.task}-{folder.name or 'objects'}-v{version}-{digest[:8]}"
+    begun = sorted(run.evaluations.glob(f"{setting.task}-*-v{version}-{digest[:8]}"))
+    return begun[0] if begun else run.evaluations / f"{setting.task}-{folder.name or 'objects'}-v{version}-{digest[:8]}"

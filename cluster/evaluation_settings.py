@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from cluster.selection import ObjectSelection
+from cluster.selection import ObjectSelection, RayAddress
 from shared.methods import MethodName
 from shared.plan import Budget
 
@@ -28,7 +28,7 @@ class EvaluateSettings(ObjectSelection):
     """Trials a shard."""
     workers: int = Field(2, ge=0, le=4096)
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""
-    ray_address: str | None = None
+    ray_address: RayAddress | None = None
     """Of a running Ray cluster; a private session on this machine where none is given."""
     rollout_limit_s: float = Field(600.0, gt=0)
     """A worker that takes longer for one trial is taken for hung, and replaced."""

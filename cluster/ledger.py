@@ -2,22 +2,34 @@
 
 `log.jsonl` is append-only, one JSON object a line. A kill can at worst tear its last line, which is then ignored and
 fenced off; so the file is both the log for people and the record that a resumption relies on.
+
+Heartbeats come the less often the longer a stage takes, so that the file of a year is no larger than that of a day.
 """
 
 import json
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from shared.errors import UsageError
 
-BEAT_S = 5.0
-"""A stage under way is noted this often; a kill loses at most so much of its wall time."""
-MAX_LOG_BYTES = 64 << 20
+BEAT_S, BEAT_SHARE = 5.0, 0.01
+"""A stage under way is noted after so many seconds, or after this share of what the attempt has spent on it if that is
+more; a kill loses at most so much of its wall time."""
+MAX_LOG_BYTES = 1 << 30
+"""Older software noted each stage every 5 s, which is 1.5 MB a day."""
+MAX_LINE_BYTES = 1 << 20
+MAX_STAGES = 1 << 14
+MAX_SOFTWARE, MAX_VERSION = 100, 100
+"""Sets of versions that are kept of a log, and characters of a version."""
+_BEAT = re.compile(
+    rb'\{"time": [0-9.]+, "event": "beat", "stage": "(?P<stage>[a-z0-9-]{1,100})", "seconds": [0-9.]+\}\n'
+)
 
 Clock = Callable[[], float]
 
@@ -36,7 +48,7 @@ class Ledger:
         self._lock = threading.Lock()
         self._seconds: dict[str, float] = {}
         self._results: dict[str, dict[str, Any]] = {}
-        self._attempt_seconds = 0.0
+        self._software: list[dict[str, str]] = []
         if path.exists():
             self._replay()
 
@@ -49,6 +61,11 @@ class Ledger:
     def seconds(self) -> dict[str, float]:
         """Wall time of each stage over all attempts, in the order they began."""
         return dict(self._seconds)
+
+    @property
+    def software(self) -> tuple[dict[str, str], ...]:
+        """Versions that attempts had, each set once, in the order of the attempts."""
+        return tuple(self._software)
 
     def result(self, stage: str) -> dict[str, Any]:
         """What a finished stage had to say."""
@@ -95,21 +112,48 @@ class Ledger:
     def _replay(self) -> None:
         if self._path.stat().st_size > MAX_LOG_BYTES:
             raise UsageError(f"{self._path}: larger than {MAX_LOG_BYTES} bytes; not the log of a run")
-        for line in self._path.read_bytes().splitlines():
+        # Of the heartbeats, nearly all of a long log, only the last of each stage counts: others are not even parsed.
+        beats: dict[bytes, bytes] = {}
+        with self._path.open("rb") as file:
+            while line := file.readline(MAX_LINE_BYTES):
+                if (beat := _BEAT.fullmatch(line)) and (len(beats) < MAX_STAGES or beat["stage"] in beats):
+                    beats[beat["stage"]] = line
+                    self._seconds.setdefault(beat["stage"].decode(), 0.0)
+                else:
+                    self._take_in(beats)
+                    self._take_in({b"": line})
+        self._take_in(beats)
+
+    def _take_in(self, lines: dict[bytes, bytes]) -> None:
+        """Take note of some lines, and forget them."""
+        for line in lines.values():
             try:
                 entry = json.loads(line)
-                stage, seconds = entry.get("stage"), entry.get("seconds")
-            except (ValueError, AttributeError):
+                stage, seconds, software = entry.get("stage"), entry.get("seconds"), entry.get("software")
+            except (ValueError, AttributeError, RecursionError):
                 continue  # Torn by a kill.
             if isinstance(stage, str) and isinstance(seconds, int | float):
+                if stage not in self._seconds and len(self._seconds) >= MAX_STAGES:
+                    continue
                 self._seconds[stage] = float(seconds)
                 if entry.get("event") == "done":
                     self._results[stage] = entry.get("result", {})
+            if isinstance(software, dict) and len(self._software) < MAX_SOFTWARE and software not in self._software:
+                self._software.append({str(name): str(version)[:MAX_VERSION] for name, version in software.items()})
+        lines.clear()
 
 
 def _repeat(beat: Callable[[], None], stop: threading.Event) -> None:
-    while not stop.wait(BEAT_S):
-        beat()
+    begun = time.monotonic()
+    while not stop.wait(pause_s(time.monotonic() - begun)):
+        # A full disk, say; the end of the stage is noted as well, and fails where that lasts.
+        with suppress(OSError):
+            beat()
+
+
+def pause_s(spent_s: float) -> float:
+    """How long until the next heartbeat of a stage on which an attempt has spent so many seconds."""
+    return max(BEAT_S, BEAT_SHARE * spent_s)
 
 
 def _ends_with_newline(path: Path) -> bool:

@@ -10,6 +10,8 @@ import logging
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+from shared.redaction import without_secrets
+
 VARIABLE = "ADAAFFORD_LOG"
 OURS = ("cluster", "collector", "learner", "shared")
 """Packages of which machines are told more than warnings."""
@@ -31,7 +33,15 @@ class JsonLines(logging.Formatter):
         line |= {name: getattr(record, name) for name in FIELDS if hasattr(record, name)}
         if record.exc_info:
             line["traceback"] = self.formatException(record.exc_info)
-        return json.dumps(line, default=str)
+        return without_secrets(json.dumps(line, default=str))
+
+
+class Lines(logging.Formatter):
+    """A record as a line for people."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See `logging.Formatter.format`."""
+        return without_secrets(super().format(record))
 
 
 def configure(environment: Mapping[str, str]) -> None:
@@ -40,11 +50,11 @@ def configure(environment: Mapping[str, str]) -> None:
     Args:
         environment: ADAAFFORD_LOG=json asks for JSON lines, and for more of them.
     """
-    if environment.get(VARIABLE) != "json":
-        logging.basicConfig(format="adaafford: %(message)s", level=logging.WARNING)
-        return
+    as_json = environment.get(VARIABLE) == "json"
     handler = logging.StreamHandler()
-    handler.setFormatter(JsonLines())
+    handler.setFormatter(JsonLines() if as_json else Lines("adaafford: %(message)s"))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    if not as_json:
+        return
     for name in OURS:
         logging.getLogger(name).setLevel(logging.INFO)

@@ -69,7 +69,7 @@ def source_of_run(run: RunFolder, version: int | None) -> Source:
         objects=f"{len(used.train)} to learn from, {len(used.validation)} to validate, {len(used.test)} to test",
         seen=used.train,
         known=seen_by(str(run.path)),
-        origin=PROCEDURAL if Path(used.folder) == run.generated_objects.resolve() else "objects of a user's folder",
+        origin=PROCEDURAL if run.generates_objects() else "objects of a user's folder",
         results=_without_title(table) if table.is_file() else "This policy was not evaluated.",
     )
 

@@ -47,6 +47,21 @@ def objects_for(
     return catalogue, folder
 
 
+def require_same_objects(wanted: Iterable[ObjectRef], folder: Path) -> None:
+    """See that a folder holds some objects, by their content; it may hold others, too.
+
+    Raises:
+        UsageError: it cannot be read, or an object is missing or has other content.
+    """
+    there = {entry.ref for entry in scan(folder).usable}
+    missing = [ref.id for ref in wanted if ref not in there]
+    if missing:
+        raise UsageError(
+            f"{folder}: {len(missing)} of the objects wanted are not there or have other content, such as "
+            f"{short(missing[0])}; name the folder that holds the same files"
+        )
+
+
 def built_in_categories(task: Task, categories: tuple[str, ...]) -> list[str]:
     """The categories that built-in objects are made of: those that are named, or all, as far as the task applies.
 

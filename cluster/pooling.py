@@ -160,6 +160,11 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         raise UsageError("name the folders of one run or several, each once")
     tested = [_tested(find(path)[0], evaluation) for path in runs]
     results = [each.results for each in tested]
+    for place, each in enumerate(results):
+        if each in results[:place]:
+            # A copy of a run, say, or a run of the same seed: its trials would count twice.
+            same = runs[results.index(each)]
+            raise UsageError(f"{runs[place]} holds the very trials of {same}; name runs of different seeds, each once")
     if len({each.novel_categories for each in tested}) > 1:
         raise UsageError("only some of the runs were tested on novel categories; compare them apart")
     if len(tasks := sorted({each.task for each in results})) > 1:

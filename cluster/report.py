@@ -45,12 +45,14 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
         "wall_seconds": round(sum(ledger.seconds.values()), 1),
         "workers": config.workers,
         "objects": {
-            "folder": used.folder,
+            # The name alone, since results are published; older runs have a whole path.
+            "folder": Path(used.folder).name,
             **{name: [ref.id for ref in getattr(used, name)] for name in ("train", "validation", "test")},
             "refused": [{"id": object_id, "reason": reason} for object_id, reason in used.refused],
         },
         "store_digest": store.digest(),
         "software": software_versions(),
+        "earlier_software": _earlier_software(run, ledger),
     }
     write_atomically(run.summary, json.dumps(summary, indent=1, allow_nan=False).encode())
     _draw(run, versions[-1])
@@ -77,6 +79,12 @@ def _rows(run: RunFolder) -> list[dict[str, Any]]:
     rows = read_json(run.training("evaluate") / RESULTS_FILE)["rows"]
     assert isinstance(rows, list)
     return rows
+
+
+def _earlier_software(run: RunFolder, ledger: Ledger) -> list[dict[str, str]]:
+    """Other versions that made parts of the run, in the order of their attempts."""
+    known = [run.begun_with(), *ledger.software]
+    return [each for n, each in enumerate(known) if each and each != software_versions() and each not in known[:n]]
 
 
 def _speed(ledger: Ledger) -> float | None:

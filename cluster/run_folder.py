@@ -2,6 +2,7 @@
 
 RUN/
   config.json            resolved configuration, git commit, package versions; written once
+  places.json            where on this machine lies what is not in the run; leave it out where the run is published
   objects.json           which objects were split how, and which were refused and why
   objects/               procedural objects, if no folder of objects was given
   store/                 the interactions, and the published policies
@@ -11,9 +12,13 @@ RUN/
   summary.json           figures
   affordance.png         one object before and after each try
   report.html            all of it to look at, in one file
+
+The folder may be renamed, moved or copied: nothing in it is found by an absolute path. Objects that lie elsewhere are
+known by their content, so that they may move, too (`adaafford resume RUN --objects FOLDER`).
 """
 
 import json
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,22 +28,30 @@ from cluster.configuration import EXECUTION_SETTINGS, CampaignConfig
 from cluster.settings import difference
 from shared.configuration import StrictModel, parse
 from shared.errors import StoreError, UsageError
-from shared.files import create_exclusively, read_bounded
+from shared.files import create_exclusively, read_bounded, write_atomically
 from shared.plan import ObjectRef
 from shared.store.provenance import software_versions
 
 MAX_DOCUMENT_BYTES = 64 << 20
+PLACE_SETTINGS = ("objects", "object_list", "start_from", "splits.train_list", "splits.test_list", "ray_address")
+"""Settings that say where something is; config.json has their last parts alone, and places.json the rest."""
 
 
 class ObjectsUsed(StrictModel):
     """objects.json: the objects of a run."""
 
     folder: str
+    """What the folder is called; `RunFolder.objects_folder` finds it."""
     train: tuple[ObjectRef, ...]
     validation: tuple[ObjectRef, ...]
     test: tuple[ObjectRef, ...]
     refused: tuple[tuple[str, str], ...]
     """(id, reason)."""
+
+    @property
+    def all(self) -> tuple[ObjectRef, ...]:
+        """Those of all three parts."""
+        return (*self.train, *self.validation, *self.test)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +64,11 @@ class RunFolder:
     def config(self) -> Path:
         """config.json."""
         return self.path / "config.json"
+
+    @property
+    def places(self) -> Path:
+        """places.json."""
+        return self.path / "places.json"
 
     @property
     def objects_file(self) -> Path:
@@ -122,6 +140,30 @@ class RunFolder:
         """What `adaafford evaluate` leaves, a folder each."""
         return self.path / "evaluations"
 
+    def objects_folder(self) -> Path:
+        """Where the run's objects lie: in the run, or where its user said last.
+
+        Raises:
+            UsageError: they are not there any more.
+        """
+        named = _read_config(self).get("objects")
+        folder = self.generated_objects.resolve() if named is None else Path(str(named))
+        if self.objects_file.is_file() and not folder.is_dir():
+            raise UsageError(
+                f"{folder}: the objects of {self.path} are not there any more; say where they are with "
+                f"`adaafford resume {self.path} --objects FOLDER`"
+            )
+        return folder
+
+    def generates_objects(self) -> bool:
+        """Whether its objects are procedural ones of its own."""
+        return _read_config(self).get("objects") is None
+
+    def begun_with(self) -> dict[str, str]:
+        """Versions of the software that the run was begun with."""
+        known = read_json(self.config).get("software")
+        return {str(name): str(version) for name, version in known.items()} if isinstance(known, dict) else {}
+
     def objects_used(self) -> ObjectsUsed:
         """What objects.json says."""
         return parse(ObjectsUsed, read_json(self.objects_file), str(self.objects_file))
@@ -134,18 +176,25 @@ def begin(path: Path, config: CampaignConfig) -> RunFolder:
         UsageError: the folder holds another run, or anything else.
     """
     run = RunFolder(path)
-    document = {"config": config.model_dump(mode="json"), "software": software_versions()}
+    settings = config.model_dump(mode="json")
+    document = {"config": _without_places(settings), "software": software_versions()}
     if path.exists() and not path.is_dir():
         raise UsageError(f"{path}: not a folder; name a new one")
     if not run.config.exists() and path.exists() and any(_foreign(path)):
         raise UsageError(f"{path}: holds something that is no run; name a new or an empty folder")
     path.mkdir(parents=True, exist_ok=True)
+    if not run.config.exists():
+        # First, since with config.json a run has begun.
+        _write_places(run, settings)
     if create_exclusively(run.config, json.dumps(document, indent=2).encode()):
         return run
-    before, now = (_decisive(each) for each in (_read_config(run), document["config"]))
+    before, now = (_decisive(each) for each in (_read_config(run), settings))
     changed = difference(before, now)
     if changed is not None:
-        raise UsageError(f"{path}: holds another run ({changed}); name a new folder, or `adaafford resume {path}`")
+        moved = f" --objects {config.objects}" if changed.startswith("'objects'") and config.objects else ""
+        raise UsageError(
+            f"{path}: holds another run ({changed}); name a new folder, or `adaafford resume {path}{moved}`"
+        )
     return run
 
 
@@ -161,9 +210,52 @@ def find(path: Path) -> tuple[RunFolder, CampaignConfig]:
     return run, parse(CampaignConfig, _read_config(run), str(run.config))
 
 
+def note_places(run: RunFolder, config: CampaignConfig) -> None:
+    """Take note that what a run needs lies elsewhere now."""
+    _write_places(run, config.model_dump(mode="json"))
+
+
+def _write_places(run: RunFolder, settings: Mapping[str, Any]) -> None:
+    found = {name: _setting(settings, name) for name in PLACE_SETTINGS}
+    places = {name: place for name, place in found.items() if place is not None}
+    if places:
+        write_atomically(run.places, json.dumps(places, indent=1).encode())
+
+
+def _without_places(settings: dict[str, Any]) -> dict[str, Any]:
+    names = {name: _setting(settings, name) for name in PLACE_SETTINGS}
+    # With a dot before it, a path's last part is not taken for one of the names that the package brings.
+    short = {
+        name: f"./{Path(place).name}" if os.sep in place else place
+        for name, place in names.items()
+        if place is not None
+    }
+    return _with_settings(settings, short | {"ray_address": None})
+
+
+def _setting(settings: Mapping[str, Any], name: str) -> str | None:
+    found: Any = settings
+    for part in name.split("."):
+        found = found.get(part) if isinstance(found, Mapping) else None
+    return None if found is None else str(found)
+
+
+def _with_settings(settings: Mapping[str, Any], values: Mapping[str, str | None]) -> dict[str, Any]:
+    """Settings with some of them replaced, each by its name with dots."""
+    told = dict(settings)
+    for name, value in values.items():
+        table, _, key = name.rpartition(".")
+        if table:
+            told[table] = {**(told.get(table) or {}), key: value}
+        else:
+            told[key] = value
+    return told
+
+
 def _foreign(path: Path) -> list[Path]:
-    """What lies in a folder apart from hidden files, which a killed attempt may have left."""
-    return [child for child in path.iterdir() if not child.name.startswith(".")]
+    """What lies in a folder apart from hidden files and places.json, which a killed attempt may have left."""
+    own = RunFolder(path).places
+    return [child for child in path.iterdir() if not child.name.startswith(".") and child != own]
 
 
 def _decisive(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -175,7 +267,9 @@ def _read_config(run: RunFolder) -> dict[str, Any]:
     config = read_json(run.config).get("config")
     if not isinstance(config, dict):
         raise UsageError(f"{run.config}: not the configuration of a run; name another folder")
-    return config
+    # Runs of older software have whole paths in config.json; of a run that was published the places are unknown.
+    places = read_json(run.places) if run.places.is_file() else {}
+    return _with_settings(config, {name: str(place) for name, place in places.items() if name in PLACE_SETTINGS})
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -1,10 +1,21 @@
 """Which objects a command works with, as far as the user says so; flags and files of several commands share this."""
 
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import field_validator
+from pydantic import AfterValidator, field_validator
 
 from shared.configuration import StrictModel
+
+
+def _without_credentials(address: str) -> str:
+    if "@" in address:
+        raise ValueError("an address may hold no user and password; Ray takes its token from RAY_AUTH_TOKEN")
+    return address
+
+
+RayAddress = Annotated[str, AfterValidator(_without_credentials)]
+"""Of a Ray cluster; it is kept and shown, so that it may hold no secret."""
 
 
 class ObjectSelection(StrictModel):

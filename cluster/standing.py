@@ -20,6 +20,7 @@ from shared.plan import Job, covered
 from shared.store import Store
 from shared.store.layout import SHARDS_FOLDER, STORE_FILE, parse_shard_id
 from shared.store.place import is_url
+from shared.store.provenance import host_of
 
 MAX_TAIL_BYTES = 1 << 14
 """Of a file of metrics; a line is far shorter."""
@@ -31,11 +32,13 @@ class WorkerNow:
 
     Attributes:
         process: its name, as `shared.files.process_name` has it.
+        host: where it runs; "" if the store does not know that.
         shard_id: of its job.
         rollout: the one under way; None while it writes, or waits for its next job.
     """
 
     process: str
+    host: str
     shard_id: str
     rollout: int | None
 
@@ -149,7 +152,9 @@ def _store(where: str, now: float) -> StoreStanding:
         policies=store.policy_versions(),
         driver=driver,
         driver_alive=driver is not None and driver.is_alive(now),
-        workers=tuple(WorkerNow(name, crumb.shard_id, crumb.rollout) for name, crumb in crumbs.items()),
+        workers=tuple(
+            WorkerNow(name, host_of(store.place, name), crumb.shard_id, crumb.rollout) for name, crumb in crumbs.items()
+        ),
     )
 
 

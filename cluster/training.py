@@ -90,7 +90,7 @@ class Trainer:
             arguments += ["--validation-objects", _written(out / "validation.txt", _ids(used.validation))]
         if init is not None:
             arguments += ["--init", str(self._run.training(init))]
-        self._learner.train(arguments, out, lambda line: self._say(f"  {line}"))
+        self._learner.train(arguments, out, lambda line: self._say(f"  {line}"), self._run.path)
         return {"policy_folder": str(out.relative_to(self._run.path))}
 
 

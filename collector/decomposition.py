@@ -13,7 +13,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +26,7 @@ from collector.coacd_process import MAX_PIECES, SETTINGS, receive, send
 from collector.pieces import MAX_ENCODED_BYTES, decode, encode
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.files import read_bounded, remove_tree, write_atomically
+from shared.interpreter import PYTHON, own_environment
 
 LIMIT_S = 120.0
 """CPU time for one mesh; the largest of published objects take some 20 s."""
@@ -142,12 +142,12 @@ class Decomposer:
     def _running(self) -> "subprocess.Popen[bytes]":
         if self._child is None or self._child.poll() is not None:
             self._child = subprocess.Popen(
-                [sys.executable, "-m", "collector.coacd_process", str(LIMIT_S)],
+                [*PYTHON, "-m", "collector.coacd_process", str(LIMIT_S)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 # Sums over several threads would depend on how many there are.
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
+                env={**own_environment(), "OMP_NUM_THREADS": "1"},
             )
         return self._child
 

@@ -1,7 +1,5 @@
 """A worker: executes jobs and commits their shards. The Ray actor and the serial mode are thin wrappers around it."""
 
-import os
-import platform
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -25,9 +23,11 @@ from shared.plan import Job, Plan
 from shared.policy import Policy
 from shared.proposers import proposer_named
 from shared.records import RolloutRecord, RolloutStatus
-from shared.reproduction import reproduction
+from shared.redaction import without_places
+from shared.reproduction import OBJECTS, STORE, reproduction
 from shared.store import Quarantined, Store
 from shared.store.layout import MAX_REASON
+from shared.store.provenance import note_machine
 from shared.vocabulary import Proposer
 
 NOTHING: Mapping[int, str] = MappingProxyType({})
@@ -45,6 +45,7 @@ class Worker:
 
     def __init__(self, store: str | Path, objects: Path) -> None:
         self._store = Store.open(store)
+        note_machine(self._store.place)
         self._folder = objects
         self._objects = ObjectCache(objects)
         self._adapters: dict[int, Adapter] = {}
@@ -82,7 +83,7 @@ class Worker:
                 under_way(index)
                 records.append(self.execute(plan, index, clock))
         under_way(None)
-        provenance = {"host": platform.node(), "pid": str(os.getpid())}
+        provenance = {}
         if plan.policy_version:
             # Beside the version in each row this says how far that was behind, where collection follows a learner.
             provenance["newest_policy"] = str(max(self._store.policy_versions(), default=0))
@@ -102,8 +103,8 @@ class Worker:
         return [
             Quarantined(
                 rollout=index,
-                reason=reason[:MAX_REASON],
-                command=reproduction(self._store.where, job.shard_id, self._folder, index),
+                reason=without_places(reason, self._folder)[:MAX_REASON],
+                command=reproduction(STORE, job.shard_id, OBJECTS, index),
             )
             for index, reason in sorted(quarantined.items())
         ]

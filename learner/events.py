@@ -1,11 +1,17 @@
-"""TensorBoard event files: a view of the metrics, where TensorBoard is installed; their record is metrics.jsonl."""
+"""TensorBoard event files: a view of the metrics, where TensorBoard is installed; their record is metrics.jsonl.
 
+The files are written here and not by `torch.utils.tensorboard`, which puts the host's name into theirs.
+"""
+
+import os
+import time
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 EVENTS_FOLDER = "tensorboard"
+_VERSION = "brain.Event:2"
 
 
 class EventFiles:
@@ -19,20 +25,36 @@ class EventFiles:
     def __init__(self, folder: Path, step: int) -> None:
         self._writer: Any = None
         if find_spec("tensorboard") is not None:
-            from torch.utils.tensorboard import SummaryWriter
+            from tensorboard.compat.proto.event_pb2 import SessionLog
+            from tensorboard.summary.writer.record_writer import RecordWriter
 
-            self._writer = SummaryWriter(str(folder), purge_step=step + 1)
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / f"events.out.tfevents.{time.time_ns()}.{os.getpid()}"
+            self._file = path.open("wb")
+            self._writer = RecordWriter(self._file)
+            self._write(file_version=_VERSION)
+            self._write(step=step + 1, session_log=SessionLog(status=SessionLog.START))
 
     def add(self, step: int, figures: Mapping[str, Any]) -> None:
         """The figures of a step, each under the stage's name; what is no number is left out."""
         if self._writer is None:
             return
-        for name, value in figures.items():
-            if isinstance(value, int | float) and name != "step":
-                self._writer.add_scalar(f"{figures['stage']}/{name}", value, step)
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        values = [
+            Summary.Value(tag=f"{figures['stage']}/{name}", simple_value=value)
+            for name, value in figures.items()
+            if isinstance(value, int | float) and name != "step"
+        ]
+        self._write(step=step, summary=Summary(value=values))
         self._writer.flush()
 
     def close(self) -> None:
         """Write what is left."""
         if self._writer is not None:
             self._writer.close()
+
+    def _write(self, **content: Any) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+
+        self._writer.write(Event(wall_time=time.time(), **content).SerializeToString())

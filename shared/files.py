@@ -1,12 +1,16 @@
 """Files that survive a kill: durable atomic writing, bounded reading, hashing, locks, and who left a temporary file.
 
-A temporary name says which process made it (host, process id, start time), so that remnants of dead writers can be
-told from the work of live ones.
+A temporary name says which process made it (boot of a machine, process id, start time), so that remnants of dead
+writers can be told from the work of live ones. It does not say the machine's name, since stores are published.
+
+Not every file system has file locks, hard links or a way to force a folder to the disk; where one of these is missing,
+something slower takes its place.
 """
 
 import errno
 import fcntl
 import hashlib
+import logging
 import os
 import re
 import secrets
@@ -26,6 +30,19 @@ TEMPORARY_PREFIX = ".tmp-"
 _PROCESS_NAME = re.compile(r"(?P<space>[^~/]*)~(?P<pid>\d{1,10})~(?P<start>\d{1,20})")
 _TEMPORARY_NAME = re.compile(r"\.tmp-[^~]*~(?P<process>[^~]*~\d+~\d+)~[0-9a-f]+")
 _LOCK_POLL_S = 0.01
+_FOREIGN_S = 86400.0
+"""What a process of another machine or boot left counts as abandoned after so long; nothing is written for a day."""
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_NOT_SUPPORTED = frozenset({errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL})
+"""How file systems refuse what they cannot do."""
+_NO_LOCKS = _NOT_SUPPORTED | {errno.ENOLCK}
+_NO_LINKS = _NOT_SUPPORTED | {errno.EPERM, errno.EMLINK}
+_NOTE_SUFFIX = ".note"
+_MOST_HOLDER = 400
+"""Bytes that are read of what a lock file says."""
+_CREATE_LOCK, _CREATE_WAIT_S = f"{TEMPORARY_PREFIX}create.lock", 60.0
+
+logger = logging.getLogger(__name__)
 
 
 def write_durably(path: Path, data: bytes) -> None:
@@ -65,10 +82,13 @@ def make_folder(path: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Force a folder's entries (creations, renames) to the disk."""
+    """Force a folder's entries (creations, renames) to the disk, where the file system can do that."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _NOT_SUPPORTED:
+            raise
     finally:
         os.close(descriptor)
 
@@ -93,13 +113,28 @@ def create_exclusively(path: Path, data: bytes) -> bool:
     temporary = path.parent / temporary_name(path.name)
     try:
         write_durably(temporary, data)
+        made = _take_name(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    if made:
+        sync_folder(path.parent)
+    return made
+
+
+def _take_name(temporary: Path, path: Path) -> bool:
+    """Give a finished file its name, if that is free."""
+    try:
         # A hard link fails where the name exists, which rename would silently replace.
         path.hardlink_to(temporary)
     except FileExistsError:
         return False
-    finally:
-        temporary.unlink(missing_ok=True)
-    sync_folder(path.parent)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        with exclusive_lock(path.parent / _CREATE_LOCK, _CREATE_WAIT_S):
+            if path.exists():
+                return False
+            temporary.rename(path)
     return True
 
 
@@ -144,6 +179,10 @@ def sha256_of(path: Path) -> str:
 def exclusive_lock(path: Path, wait_seconds: float = 0.0) -> Iterator[None]:
     """Hold a file's lock; the kernel gives it back when the holder dies, however it dies.
 
+    Where the file system knows no locks, a second file, which only one process can create, takes the lock's place. It
+    names its holder and is taken over once that process has ended on this machine; of a holder on another machine that
+    cannot be told, so the user is asked.
+
     Args:
         path: the lock file; it is made where missing, and stays.
         wait_seconds: how long to wait for another holder.
@@ -151,29 +190,124 @@ def exclusive_lock(path: Path, wait_seconds: float = 0.0) -> Iterator[None]:
     Raises:
         UsageError: another process holds it; the message names that process.
     """
+    deadline = time.monotonic() + wait_seconds
+    note = path.with_name(f"{path.name}{_NOTE_SUFFIX}")
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
     try:
-        _acquire(descriptor, path, time.monotonic() + wait_seconds)
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()} on {host_name()}".encode(), 0)
-        yield
+        if _acquire(descriptor, path, deadline):
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, _holder().encode(), 0)
+            try:
+                # Of another machine, say, for which the same file system has no locks.
+                _wait_for_note(note, deadline)
+                yield
+            finally:
+                os.ftruncate(descriptor, 0)
+        else:
+            logger.info("%s: this file system knows no locks; the file %s takes their place", path.parent, note.name)
+            own = _write_note(note, deadline)
+            try:
+                _refuse_if_held(path, os.pread(descriptor, _MOST_HOLDER, 0).decode(errors="replace"))
+                yield
+            finally:
+                if _read_note(note) == own:
+                    note.unlink(missing_ok=True)
     finally:
         # Closing gives the lock back. The file stays: unlinking it would let two processes lock two files of one name.
         os.close(descriptor)
 
 
-def _acquire(descriptor: int, path: Path, deadline: float) -> None:
+def _acquire(descriptor: int, path: Path, deadline: float) -> bool:
+    """Take the kernel's lock; False where the file system has none."""
     while True:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
+            return True
         except OSError as error:
+            if error.errno in _NO_LOCKS:
+                return False
             if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
                 raise
         if time.monotonic() >= deadline:
-            holder = os.pread(descriptor, 200, 0).decode(errors="replace") or "unknown"
-            raise UsageError(f"{path.parent} is in use by process {holder}; wait for it or stop it")
+            raise _in_use(path, os.pread(descriptor, _MOST_HOLDER, 0).decode(errors="replace"))
         time.sleep(_LOCK_POLL_S)
+
+
+def _write_note(note: Path, deadline: float) -> str:
+    """Create the file that stands for a lock, or wait for it; returns its content."""
+    own = f"{_holder()}\n{secrets.token_hex(8)}"
+    while True:
+        try:
+            descriptor = os.open(note, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+        except FileExistsError:
+            _wait_for_note(note, deadline)
+            continue
+        try:
+            _write_all(descriptor, own.encode())
+        except OSError:
+            note.unlink(missing_ok=True)
+            raise
+        finally:
+            os.close(descriptor)
+        return own
+
+
+def _wait_for_note(note: Path, deadline: float) -> None:
+    """Wait until no live process holds a lock by this file; one that is left of a dead process is removed."""
+    while (held := _read_note(note)) is not None:
+        if is_gone(_process_of(held)):
+            _remove_note(note, held)
+        elif time.monotonic() >= deadline:
+            raise _in_use(note, held, f", or remove {note} if you know that it has ended")
+        time.sleep(_LOCK_POLL_S)
+
+
+def _remove_note(note: Path, held: str) -> None:
+    """Remove what a dead process left; of several that would do so, one does, and none removes another's new file."""
+    guard = note.with_name(f"{note.name}.clearing")
+    try:
+        os.close(os.open(guard, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644))
+    except FileExistsError:
+        if time.time() - guard.lstat().st_mtime > _FOREIGN_S:
+            raise UsageError(f"{guard}: left by a process that was killed; remove it and try again") from None
+        return
+    try:
+        if _read_note(note) == held:
+            note.unlink(missing_ok=True)
+    finally:
+        guard.unlink(missing_ok=True)
+
+
+def _read_note(note: Path) -> str | None:
+    try:
+        descriptor = os.open(note, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except FileNotFoundError:
+        return None
+    try:
+        return os.read(descriptor, _MOST_HOLDER).decode(errors="replace")
+    finally:
+        os.close(descriptor)
+
+
+def _refuse_if_held(path: Path, held: str) -> None:
+    """Refuse a lock whose file names a process that may hold it by the kernel's lock, on another machine."""
+    if held and not is_gone(_process_of(held)):
+        raise _in_use(path, held, f", or empty {path} if you know that it has ended")
+
+
+def _holder() -> str:
+    """What a lock file says of its holder: a line for people, and the process's name."""
+    return f"{os.getpid()} on {host_name()}\n{process_name()}"
+
+
+def _process_of(held: str) -> str:
+    lines = held.splitlines()
+    return lines[1] if len(lines) > 1 else ""
+
+
+def _in_use(path: Path, held: str, otherwise: str = "") -> UsageError:
+    holder = "".join(filter(str.isprintable, (held.splitlines() or [""])[0])) or "unknown"
+    return UsageError(f"{path.parent} is in use by process {holder}; wait for it or stop it{otherwise}")
 
 
 def host_name() -> str:
@@ -182,23 +316,36 @@ def host_name() -> str:
 
 
 @cache
+def machine_name() -> str:
+    """This machine since its last start, as no other is called and without telling its name; for files.
+
+    Two machines may have one name, and both the same disk; the boot id is a random number of each start of each.
+    """
+    try:
+        boot = _BOOT_ID.read_text(encoding="ascii", errors="replace").strip()
+    except OSError:
+        boot = host_name()
+    return hashlib.sha256(f"adaafford {boot}".encode()).hexdigest()[:16]
+
+
+@cache
 def _process_space() -> str:
-    """What process ids are unique within: the host, and the namespace, since containers may share a host's name."""
+    """What process ids are unique within: the machine's boot, and the namespace, of which each container has one."""
     try:
         namespace = re.sub(r"\D", "", Path("/proc/self/ns/pid").readlink().name)
     except OSError:
         namespace = "0"
-    return f"{host_name()}-{namespace}"
+    return f"{machine_name()}-{namespace}"
 
 
 def process_name() -> str:
-    """This process, as no other is called, on any host: what its files can be named by."""
+    """This process, as no other is called, on any machine: what its files can be named by."""
     process = os.getpid()
     return f"{_process_space()}~{process}~{_start_ticks(process)}"
 
 
 def is_gone(process: str) -> bool:
-    """Whether the process of this `process_name` has ended for certain; one on another host may be alive."""
+    """Whether the process of this `process_name` has ended for certain; one on another machine may be alive."""
     match = _PROCESS_NAME.fullmatch(process)
     if match is None or match["space"] != _process_space():
         return False
@@ -206,10 +353,26 @@ def is_gone(process: str) -> bool:
 
 
 def end_if_here(process: str) -> None:
-    """Kill the process of this `process_name` if it is one of this host's."""
+    """Kill the process of this `process_name` if it is one of this machine's."""
     match = _PROCESS_NAME.fullmatch(process)
     if match is not None and match["space"] == _process_space() and not is_gone(process):
         os.kill(int(match["pid"]), signal.SIGKILL)
+
+
+def is_abandoned(process: str, path: Path) -> bool:
+    """Whether nobody will go on with a file or folder that a process left, as far as that can be told from here.
+
+    Args:
+        process: its `process_name`.
+        path: what it left; of a process on another machine, or before this one's last start, its age decides.
+    """
+    match = _PROCESS_NAME.fullmatch(process)
+    if match is None or match["space"] == _process_space():
+        return is_gone(process)
+    try:
+        return time.time() - path.lstat().st_mtime > _FOREIGN_S
+    except OSError:
+        return False
 
 
 def temporary_name(name: str) -> str:
@@ -220,13 +383,13 @@ def temporary_name(name: str) -> str:
 def remove_if_abandoned(path: Path) -> bool:
     """Remove a temporary file or folder whose writer is dead; leave one that is, or may be, still written.
 
-    A writer on another host or in another container may be alive, so its remnants stay.
+    A writer on another machine or in another container may be alive, so its remnants stay for a day.
 
     Returns:
         Whether it was removed.
     """
     match = _TEMPORARY_NAME.fullmatch(path.name)
-    if match is None or not is_gone(match["process"]):
+    if match is None or not is_abandoned(match["process"], path):
         return False
     remove_tree(path)
     return True

@@ -3,6 +3,9 @@
 import shlex
 from pathlib import Path
 
+STORE, OBJECTS = "STORE", "OBJECTS"
+"""What stands for the store and the objects in a command that is kept, since both may move."""
+
 
 def reproduction(store: Path | str, shard_id: str, objects: Path | str, rollout: int | None = None) -> str:
     """The command, as a shell takes it.

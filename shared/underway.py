@@ -22,7 +22,7 @@ from pydantic import Field, ValidationError
 
 from shared.configuration import StrictModel
 from shared.errors import StoreError
-from shared.files import is_gone, process_name, read_bounded
+from shared.files import is_abandoned, is_gone, process_name, read_bounded
 
 if TYPE_CHECKING:
     from shared.store.place import Place
@@ -117,9 +117,9 @@ class Underway:
             self._file(process, suffix).unlink(missing_ok=True)
 
     def sweep(self) -> int:
-        """Remove what ended processes of this host left; returns how many files that was."""
+        """Remove what ended processes left, as far as that can be told; returns how many files that was."""
         crumbs = [process for process in self.crumbs() if is_gone(process)] if self.url else []
-        files = [file for file in self.folder.iterdir() if is_gone(file.stem)] if self.folder.is_dir() else []
+        files = [f for f in self.folder.iterdir() if is_abandoned(f.stem, f)] if self.folder.is_dir() else []
         for process in crumbs:
             _place(self.url).remove(_key(process))
         for file in files:

@@ -40,7 +40,7 @@ def make_finished_run(path: Path, objects: int = 4, task: str = "push-faucet") -
     generate(run.generated_objects, {"Faucet": objects}, seed=1)
     refs = [entry.ref for entry in scan(run.generated_objects).usable]
     used = ObjectsUsed(
-        folder=str(run.generated_objects.resolve()),
+        folder=run.generated_objects.name,
         train=tuple(refs[: objects // 2]),
         validation=(),
         test=tuple(refs[objects // 2 :]),

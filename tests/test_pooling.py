@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -158,6 +159,7 @@ def test_what_cannot_be_pooled_is_said_in_a_line(
 ) -> None:
     make_run(tmp_path / "door", 3, {"a": "3" * 64}, task="pull-closed-door")
     make_run(tmp_path / "novel", 4, {"a": "4" * 64}, trained_on="Door")
+    shutil.copytree(runs[0][0], tmp_path / "copy")
     for arguments, message in (
         ([str(runs[0][0]), str(tmp_path / "door")], "different tasks (pull-closed-door, push-faucet)"),
         ([str(tmp_path)], "holds no run"),
@@ -166,6 +168,7 @@ def test_what_cannot_be_pooled_is_said_in_a_line(
         ([], "name the folders"),
         ([str(runs[0][0]), "--out", __file__], "no folder can be made of this name"),
         ([str(runs[0][0])] * 2, "each once"),
+        ([str(runs[0][0]), str(tmp_path / "copy")], f"copy holds the very trials of {runs[0][0]}"),
     ):
         assert adaafford(["compare", *arguments]) == 2
         assert message in capsys.readouterr().err.splitlines()[-1]

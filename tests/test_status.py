@@ -13,15 +13,16 @@ from hypothesis import strategies as st
 from cluster.cli import run
 from cluster.commands.status import as_json, table
 from cluster.ledger import Ledger
-from cluster.logs import JsonLines, configure
+from cluster.logs import JsonLines, Lines, configure
 from cluster.progress import RECENT_S, CollectionProgress
 from cluster.standing import standing_of
 from cluster.status import SILENT_S, DriverStatus, StatusKeeper, read_status
 from collector.receipt import Receipt
 from shared.errors import UsageError
-from shared.files import process_name
+from shared.files import host_name, process_name
 from shared.plan import Job, Plan
 from shared.store import Store, verify
+from shared.store.provenance import note_machine
 from shared.underway import Crumb
 from tests.fabricate import fabricate_rollouts, fabricate_setting
 
@@ -70,7 +71,8 @@ def test_a_store_says_what_is_done_and_left(where: str, capsys: pytest.CaptureFi
     told = json.loads(capsys.readouterr().out)["stores"][0]
     assert told["rollouts"] == {"random-v0": 4}
     assert told["policies"] == [3]
-    assert told["workers"] == [{"process": process_name(), "shard_id": "aip-v3-00000004-00000008", "rollout": 5}]
+    worker = {"process": process_name(), "host": "", "shard_id": "aip-v3-00000004-00000008", "rollout": 5}
+    assert told["workers"] == [worker]
     driver = told["driver"]
     assert (driver["left"], driver["left_s"], driver["success_rate"], driver["per_s"]) == (20, 10.0, 0.25, 40.0)
     assert told["driver_alive"]
@@ -80,6 +82,8 @@ def test_a_store_says_what_is_done_and_left(where: str, capsys: pytest.CaptureFi
     assert "35.0 interactions/s of late, 40.0 in all" in shown
     assert "2, 4 replaced; 1 rollouts quarantined" in shown
     assert "rollout 5" in shown
+    note_machine(store.place)
+    assert standing_of(where).stores[0].workers[0].host == host_name()
     store.underway.forget(process_name())
     assert verify(store) == [], "how it stands is no data, and no stranger either"
 
@@ -206,10 +210,10 @@ def test_a_log_line_is_one_json_object_that_names_rollout_and_worker() -> None:
 
 
 def test_logging_is_for_people_unless_machines_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[dict[str, object]] = []
+    given: list[dict[str, list[logging.Handler]]] = []
     monkeypatch.setattr(logging, "basicConfig", lambda **options: given.append(options))
     configure({})
-    assert "format" in given[0]
+    assert isinstance(given[0]["handlers"][0].formatter, Lines)
     levels = {name: logging.getLogger(name).level for name in ("cluster", "collector", "learner", "shared")}
     try:
         configure({"ADAAFFORD_LOG": "json"})
@@ -217,5 +221,5 @@ def test_logging_is_for_people_unless_machines_are_asked_for(monkeypatch: pytest
     finally:
         for name, level in levels.items():
             logging.getLogger(name).setLevel(level)
-    (handler,) = given[1]["handlers"]  # type: ignore[misc]
+    (handler,) = given[1]["handlers"]
     assert isinstance(handler.formatter, JsonLines)

@@ -1,9 +1,7 @@
 """How fast is collection? What users run is timed, and beside it the published protocol on some of the same trials."""
 
-import os
 import resource
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,6 +17,7 @@ from collector.partnet import URDF_FILE
 from collector.published import PublishedRequest, PublishedTiming
 from collector.worker import Worker
 from shared.errors import UsageError, WorkerError
+from shared.interpreter import PYTHON, own_environment
 from shared.plan import ROLLOUTS_PER_SHARD, Job, Plan, missing_jobs
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store, info
@@ -184,10 +183,10 @@ def published_trial(request: PublishedRequest) -> PublishedTiming:
     Raises:
         WorkerError: the process failed, or took longer than any trial may.
     """
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment = own_environment() | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
-            [sys.executable, "-m", "collector.published"],
+            [*PYTHON, "-m", "collector.published"],
             input=request.model_dump_json(),
             capture_output=True,
             text=True,

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from shared.errors import UsageError, WorkerError
+from shared.interpreter import PYTHON, own_environment
 
 BUCKET = "adaafford"
 
@@ -39,8 +40,9 @@ def loopback_server() -> Iterator[str]:
     """
     if importlib.util.find_spec("moto") is None:
         raise UsageError("an S3 server on loopback needs the development dependencies; install adaafford[dev]")
-    command = [sys.executable, "-m", "cluster.benchmarks.s3_server"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+    command = [*PYTHON, "-m", "cluster.benchmarks.s3_server"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=own_environment()) as server:
         assert server.stdin is not None
         assert server.stdout is not None
         try:

@@ -1,5 +1,6 @@
 """`adaafford collect`: collection alone, into one store."""
 
+import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from pydantic import Field
 
-from cluster.selection import ObjectSelection
+from cluster.selection import ObjectSelection, RayAddress
 from cluster.settings import early_flags, layered, parse_flags
 from shared.configuration import CollectionConfig
 from shared.errors import UsageError
@@ -33,7 +34,7 @@ class CollectSettings(ObjectSelection):
     """Everything random derives from it."""
     workers: int = Field(2, ge=0, le=4096)
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""
-    ray_address: str | None = None
+    ray_address: RayAddress | None = None
     """Of a running Ray cluster; a private session on this machine where none is given."""
     rollout_limit_s: float = Field(300.0, gt=0)
     """A worker that takes longer for one rollout is taken for hung, and replaced; after three times the rollout is
@@ -85,6 +86,7 @@ def _collect(command: CollectCommand) -> None:
     from shared.plan import Plan, Setting
     from shared.store import Store
     from shared.store.place import absolute, folder_beside
+    from shared.store.provenance import changed_versions
 
     chosen, where = command.settings, absolute(command.store)
     catalogue, folder = objects_for(
@@ -101,6 +103,8 @@ def _collect(command: CollectCommand) -> None:
         collection=task_named(chosen.task).resolve(chosen.collection),
     )
     store = Store.create(where, setting)
+    if changed := changed_versions(store.document.software):
+        print(f"{store.where}: begun with other software: {changed}; what is added may differ by it", file=sys.stderr)
     plan: Plan | Newest
     if command.policy == "latest":
         plan = Newest(command.proposer, chosen.per_version)

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from cluster.settings import parse_flags
+from shared.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,6 +18,10 @@ class ResumeCommand:
     """Folder of the run."""
     workers: int | None = None
     """Instead of the number of workers that the run was begun with."""
+    objects: Path | None = None
+    """Where the folder of objects that the run was begun with lies now; the run remembers it."""
+    start_from: str | None = None
+    """Where the policy that the run is to start from lies now; the run remembers it."""
 
 
 def main(args: list[str]) -> int:
@@ -24,11 +29,20 @@ def main(args: list[str]) -> int:
     command = parse_flags(ResumeCommand, args, "resume")
     from cluster.campaign import Campaign
     from cluster.configuration import CampaignConfig
-    from cluster.run_folder import find
+    from cluster.objects import require_same_objects
+    from cluster.run_folder import find, note_places
     from shared.configuration import parse
 
     folder, config = find(command.run)
-    if command.workers is not None:
-        config = parse(CampaignConfig, config.model_dump() | {"workers": command.workers}, "resume")
+    moved = {name: value for name in ("objects", "start_from") if (value := getattr(command, name)) is not None}
+    for name in moved:
+        if getattr(config, name) is None:
+            raise UsageError(f"{command.run}: was begun without '{name}'; leave --{name.replace('_', '-')} out")
+    own = {} if command.workers is None else {"workers": command.workers}
+    config = parse(CampaignConfig, config.model_dump() | moved | own, "resume")
+    if config.objects is not None and command.objects is not None and folder.objects_file.is_file():
+        require_same_objects(folder.objects_used().all, config.objects)
+    if moved:
+        note_places(folder, config)
     Campaign(folder, config).execute()
     return 0

@@ -128,7 +128,9 @@ def _store_rows(store: "StoreStanding", now: float) -> list[tuple[str, str]]:
     if store.driver_alive:
         for worker in store.workers[:MOST_WORKERS]:
             doing = "between rollouts" if worker.rollout is None else f"rollout {worker.rollout}"
-            rows.append(("worker", f"{worker.process}: {worker.shard_id}, {doing}"))
+            _, number, _ = (*worker.process.split("~", 2), "", "")[:3]
+            where = f"process {number} on {worker.host}" if worker.host else worker.process
+            rows.append(("worker", f"{where}: {worker.shard_id}, {doing}"))
         if len(store.workers) > MOST_WORKERS:
             rows.append(("", f"and {len(store.workers) - MOST_WORKERS} more"))
     return rows

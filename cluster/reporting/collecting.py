@@ -12,6 +12,7 @@ from cluster.ledger import Ledger
 from cluster.reporting.page import Cell, Drawing, Section, Table, plain, shortened
 from cluster.reporting.style import ACCENT, SECOND, laid_out
 from shared.store import Store
+from shared.store.info import quarantined_in
 from shared.store.layout import Quarantined
 
 BAR_HEIGHT = 26
@@ -33,7 +34,7 @@ def collection_section(summary: Summary, store: Store, ledger: Ledger) -> Sectio
     Raises:
         StoreError: a manifest is damaged or foreign.
     """
-    quarantined = [each for manifest in store.committed() for each in manifest.quarantined]
+    quarantined = quarantined_in(store.committed())
     objects = summary["objects"]
     speed = summary["interactions_per_core_second"]
     lead = (

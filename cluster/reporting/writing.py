@@ -17,6 +17,7 @@ from cluster.reporting.results import Results, further_section, read_results, re
 from cluster.reporting.training import training_section
 from cluster.run_folder import RunFolder, read_json
 from shared.adaptation import Adapter
+from shared.errors import UsageError
 from shared.files import read_bounded, write_atomically
 from shared.policy import Policy
 from shared.store import Store
@@ -81,13 +82,18 @@ def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Call
     from cluster.reporting.laboratory import Laboratory, first_readable, hinge_twins
 
     used, setting = run.objects_used(), evaluation.setting
-    target = first_readable(Path(used.folder), used.test, setting)
+    try:
+        target = first_readable(run.objects_folder(), used.test, setting)
+    except UsageError as error:
+        say(str(error))
+        return _not_tried(run)
     with TemporaryDirectory(prefix="adaafford-report-") as folder:
         return hidden_facts_section(Laboratory(setting, adapter), target, hinge_twins(setting, Path(folder)), say)
 
 
 def _not_tried(run: RunFolder) -> Section:
-    how = f"Made by `adaafford report {run.path}`, which tries test objects under other hidden facts in the simulator."
+    name = run.path.resolve().name
+    how = f"Made by `adaafford report {name}`, which tries test objects under other hidden facts in the simulator."
     return Section("hidden-facts", "Affordance under hidden facts", (how,))
 
 
@@ -110,8 +116,13 @@ def _subtitle(summary: Mapping[str, Any], config: CampaignConfig, results: Resul
 
 def _facts(summary: Mapping[str, Any], run: RunFolder) -> tuple[tuple[str, str], ...]:
     return (
-        ("run", str(run.path)),
+        ("run", run.path.resolve().name),
         ("objects", shortened(summary["objects"]["folder"])),
         ("store digest", summary["store_digest"]),
-        ("software", ", ".join(f"{name} {version}" for name, version in summary["software"].items())),
+        ("software", _versions(summary["software"])),
+        *(("earlier software", _versions(each)) for each in summary["earlier_software"]),
     )
+
+
+def _versions(software: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {version}" for name, version in software.items())

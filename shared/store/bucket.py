@@ -18,6 +18,7 @@ from obstore.exceptions import AlreadyExistsError, BaseError, GenericError, Prec
 from obstore.store import S3Store
 
 from shared.errors import StoreError, UsageError
+from shared.redaction import without_secrets
 from shared.store.place import URL_SCHEME, Publication
 
 AT_ONCE = 16
@@ -236,4 +237,4 @@ def _parsed(url: str) -> tuple[str, str]:
 
 def _line(error: Exception) -> str:
     """An error of the client in one line of bounded length."""
-    return " ".join(str(error).split("\n\nDebug source")[0].split())[:200]
+    return without_secrets(" ".join(str(error).split("\n\nDebug source")[0].split()))[:200]

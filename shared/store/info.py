@@ -1,9 +1,11 @@
 """What a store holds, in figures."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+from shared.reproduction import OBJECTS, STORE, reproduction
 from shared.store.layout import MANIFEST_FILE, MAX_DOCUMENT_BYTES, Quarantined, ShardManifest
 from shared.store.reader import shard_folder
 from shared.store.store import Store
@@ -48,6 +50,17 @@ class StoreInfo:
         return self.bytes / self.interactions if self.interactions else float("nan")
 
 
+def quarantined_in(
+    manifests: Iterable[ShardManifest], store: Path | str = STORE, objects: Path | str = OBJECTS
+) -> tuple[Quarantined, ...]:
+    """What some shards have quarantined, with the command that executes each rollout where the store now is."""
+    return tuple(
+        each.model_copy(update={"command": reproduction(store, manifest.shard_id, objects, each.rollout)})
+        for manifest in manifests
+        for each in manifest.quarantined
+    )
+
+
 def info(store: Store) -> StoreInfo:
     """Count what a store holds.
 
@@ -76,7 +89,7 @@ def info(store: Store) -> StoreInfo:
         by_role=tally(table["role"]),
         by_outcome=dict(sorted(Counter(table["outcome"]).items())),
         by_status=dict(sorted(Counter(store.rollouts().column("status").to_pylist()).items())),
-        quarantined=tuple(each for manifest in manifests for each in manifest.quarantined),
+        quarantined=quarantined_in(manifests, store.where),
     )
 
 

@@ -1,15 +1,29 @@
-"""What made a shard: software, commit and process. Kept beside the data, never part of the content digest."""
+"""What made a shard: software, commit and process. Kept beside the data, never part of the content digest.
 
+    STORE/status/machine-<name>.json    which host a machine's name in the manifests stands for; no data
+
+Manifests are published with the data, so they name a machine by a number alone. The host's name is in the folder of
+what tells of the moment, which no copy, export or digest takes along.
+"""
+
+import json
 import os
 import platform
 import re
+from collections.abc import Mapping
+from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-from shared.files import host_name
+from shared.errors import StoreError
+from shared.files import host_name, machine_name
+from shared.store.layout import STATUS_FOLDER
+from shared.store.place import Place
 
 _PACKAGES = ("adaafford", "numpy", "pyarrow", "zarr", "torch", "sapien", "ray", "embreex")
+
+_MAX_NOTE_BYTES = 1 << 12
 
 
 @cache
@@ -26,8 +40,34 @@ def software_versions() -> dict[str, str]:
 
 
 def process_provenance() -> dict[str, str]:
-    """Host and process."""
-    return {"host": host_name(), "pid": str(os.getpid())}
+    """Machine and process."""
+    return {"machine": machine_name(), "pid": str(os.getpid())}
+
+
+def note_machine(place: Place) -> None:
+    """Write down in a store which host this machine is; nothing depends on it, so it is no error if that fails."""
+    with suppress(StoreError, OSError):
+        place.create(_key(machine_name()), json.dumps({"host": host_name()}).encode())
+
+
+def host_of(place: Place, process: str) -> str:
+    """The host of a process, by its `shared.files.process_name`; "" if the store does not know it."""
+    try:
+        found = json.loads(place.read(_key(process.partition("-")[0]), _MAX_NOTE_BYTES))["host"]
+    except (StoreError, ValueError, KeyError, TypeError, RecursionError):
+        return ""
+    return found if isinstance(found, str) else ""
+
+
+def _key(machine: str) -> str:
+    return f"{STATUS_FOLDER}/machine-{machine}.json"
+
+
+def changed_versions(before: Mapping[str, str], now: Mapping[str, str] | None = None) -> str:
+    """What differs between two sets of versions, such as "numpy 2.1.0 (now 2.2.0)"; "" if nothing does."""
+    now = software_versions() if now is None else now
+    names = [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
+    return ", ".join(f"{name} {before.get(name, 'none')[:40]} (now {now.get(name, 'none')[:40]})" for name in names)
 
 
 def _git_commit(root: Path) -> str:

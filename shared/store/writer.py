@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from shared.errors import StoreError
 from shared.plan import Job
 from shared.records import RolloutRecord
+from shared.reproduction import OBJECTS, STORE, reproduction
 from shared.store import observations
 from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, InteractionRow, RolloutRow
 from shared.store.digest import rollout_digest
@@ -113,6 +114,7 @@ def _describe(
     provenance: Mapping[str, str],
     quarantined: Sequence[Quarantined],
 ) -> ShardManifest:
+    """The manifest; no host's name and no path goes into it, also of shards that older software wrote."""
     return ShardManifest(
         plan_key=job.plan_key,
         start=job.start,
@@ -123,8 +125,11 @@ def _describe(
         files={n: FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) for n, data in files.items()},
         digests=tuple(rollout_digest(rollout) for rollout in rollouts),
         software=software_versions(),
-        provenance=process_provenance() | {name: str(value) for name, value in provenance.items()},
-        quarantined=tuple(quarantined),
+        provenance=process_provenance() | {n: str(value) for n, value in provenance.items() if n != "host"},
+        quarantined=tuple(
+            each.model_copy(update={"command": reproduction(STORE, job.shard_id, OBJECTS, each.rollout)})
+            for each in quarantined
+        ),
     )
 
 
