@@ -148,12 +148,14 @@ class RunFolder:
         """
         named = _read_config(self).get("objects")
         folder = self.generated_objects.resolve() if named is None else Path(str(named))
-        if self.objects_file.is_file() and not folder.is_dir():
-            raise UsageError(
-                f"{folder}: the objects of {self.path} are not there any more; say where they are with "
-                f"`adaafford resume {self.path} --objects FOLDER`"
-            )
-        return folder
+        if not self.objects_file.is_file() or folder.is_dir():
+            return folder
+        if named is None:
+            raise UsageError(f"{folder}: the run's own objects are not there any more; restore the folder from a copy")
+        raise UsageError(
+            f"{folder}: the objects of {self.path} are not there any more; say where they are with "
+            f"`adaafford resume {self.path} --objects FOLDER`"
+        )
 
     def generates_objects(self) -> bool:
         """Whether its objects are procedural ones of its own."""
@@ -220,6 +222,8 @@ def _write_places(run: RunFolder, settings: Mapping[str, Any]) -> None:
     places = {name: place for name, place in found.items() if place is not None}
     if places:
         write_atomically(run.places, json.dumps(places, indent=1).encode())
+    else:
+        run.places.unlink(missing_ok=True)
 
 
 def _without_places(settings: dict[str, Any]) -> dict[str, Any]:

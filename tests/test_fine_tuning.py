@@ -78,7 +78,7 @@ def test_a_run_that_started_from_a_policy_is_not_evaluated_on_what_that_has_seen
     used = made.objects_used()
     own = {ref.content_hash for ref in used.train}
     assert seen_by(str(made.path)) == own | seen_by(str(source.path)) > own
-    told = EvaluateSettings(objects=Path(source.objects_used().folder), methods=("where2act",), trials=1, queries=1)
+    told = EvaluateSettings(objects=source.objects_folder(), methods=("where2act",), trials=1, queries=1)
     evaluate_run(made.path, told.model_copy(update={"workers": 0}), tmp_path / "out")
     tested = {ref.content_hash for ref in Store.open(tmp_path / "out" / "store").setting.objects}
     assert tested

@@ -63,6 +63,13 @@ def test_a_run_finds_its_own_objects_wherever_it_is(tmp_path: Path) -> None:
         assert source_of_run(found, None).origin == PROCEDURAL
 
 
+def test_a_run_that_lost_its_own_objects_says_so(tmp_path: Path) -> None:
+    run = make_finished_run(tmp_path / "a")
+    shutil.rmtree(run.generated_objects)
+    with pytest.raises(UsageError, match="own objects are not there any more; restore the folder from a copy"):
+        run.objects_folder()
+
+
 def test_a_run_of_older_software_finds_its_objects_after_it_was_moved(tmp_path: Path) -> None:
     run = make_finished_run(tmp_path / "a")
     used = json.loads(run.objects_file.read_text()) | {"folder": str((run.path / "objects").resolve())}
@@ -152,6 +159,9 @@ def test_a_kill_before_the_configuration_was_written_leaves_a_folder_that_is_fre
     run.config.unlink()
     assert run.places.exists()
     assert begin(run.path, config) == run
+    run.config.unlink()
+    assert begin(run.path, CampaignConfig()) == run
+    assert find(run.path)[1].objects is None
 
 
 def test_what_a_policy_has_seen_is_known_through_a_link(tmp_path: Path) -> None:
