@@ -12,7 +12,7 @@ A robot's author implements `Environment` over a camera and an arm, and lets the
 from importlib.metadata import version
 
 from adaafford.pretrained import load_policy
-from adaafford.scans import ScanFrame, checked_scan, observation_of, read_scan
+from adaafford.scans import ScanFrame, checked_scan, doubtful_up, observation_of, read_scan
 from shared.adaptation import Adapter
 from shared.errors import AdaAffordError
 from shared.policy import Policy
@@ -48,6 +48,7 @@ __all__ = [
     "Store",
     "__version__",
     "checked_scan",
+    "doubtful_up",
     "load_policy",
     "observation_of",
     "open_store",
