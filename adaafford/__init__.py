@@ -20,7 +20,7 @@ __version__ = version("adaafford")
 
 if TYPE_CHECKING:
     from adaafford.pretrained import load_policy
-    from adaafford.scans import ScanFrame, checked_scan, observation_of, read_scan
+    from adaafford.scans import ScanFrame, checked_scan, doubtful_up, observation_of, read_scan
     from shared.adaptation import Adapter
     from shared.errors import AdaAffordError
     from shared.policy import Policy
@@ -41,7 +41,7 @@ else:
     # Imported when it is first asked for: the command line begins here, too, and its help is not to wait for PyTorch.
     _HOMES = {
         "adaafford.pretrained": ("load_policy",),
-        "adaafford.scans": ("ScanFrame", "checked_scan", "observation_of", "read_scan"),
+        "adaafford.scans": ("ScanFrame", "checked_scan", "doubtful_up", "observation_of", "read_scan"),
         "shared.adaptation": ("Adapter",),
         "shared.errors": ("AdaAffordError",),
         "shared.policy": ("Policy",),
@@ -85,6 +85,7 @@ __all__ = [
     "Store",
     "__version__",
     "checked_scan",
+    "doubtful_up",
     "load_policy",
     "observation_of",
     "open_store",

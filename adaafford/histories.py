@@ -13,12 +13,15 @@ Everything is in the frame of the clouds, in metres and radians; `cloud` names a
 interaction without an outcome is a proposal that nobody has tried yet.
 """
 
+import json
+import os
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, field_validator
 
+from adaafford.columns import shown, without_mark
 from adaafford.scans import ScanFrame, Vector, action_at
 from shared.configuration import StrictModel
 from shared.errors import UsageError
@@ -29,6 +32,19 @@ MAX_HISTORY_BYTES = 1 << 20
 MAX_TRIES = 64
 SUCCESS_MOTION = 0.01
 """Motion that counts as a success unless it is said otherwise: tau, rad or m, as published."""
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def _printable(name: str) -> str:
+    if not name.isprintable():
+        raise ValueError("needs a name without control characters")
+    return name
+
+
+ScanName = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
+"""The path of a cloud's file."""
 
 
 class TriedOutcome(StrictModel):
@@ -51,7 +67,7 @@ class TriedOutcome(StrictModel):
 class TriedInteraction(StrictModel):
     """One try, or a proposal for one."""
 
-    cloud: str = Field(min_length=1, max_length=1000)
+    cloud: ScanName
     """The scan that was taken before it: a path relative to the history, which does not lead out of its folder."""
     cloud_sha256: str | None = Field(None, pattern=r"^[0-9a-f]{64}$")
     """Of that file: a scan that was written over since is not what the try was made on. Unchecked where left out."""
@@ -145,17 +161,47 @@ def read_history(path: Path) -> History:
         UsageError: it is no history, with the first thing that is wrong.
         StoreError: it is no regular file, or too large.
     """
-    data = read_bounded(path, MAX_HISTORY_BYTES)
-    try:
-        history = History.model_validate_json(data)
-    except ValidationError as error:
-        problem = error.errors()[0]
-        place = ".".join(map(str, problem["loc"])) or "the file"
-        raise UsageError(f"{path}: {place}: {problem['msg'][:150]}; docs/robot.md says what a history holds") from None
+    if os.path.exists(path) and not os.path.isfile(path):  # noqa: PTH110, PTH113 - of a name too long pathlib raises.
+        raise UsageError(f"{path}: a folder, pipe or device, and no file; name a history, or a file that is to be one")
+    history = parse_json(
+        History, read_bounded(path, MAX_HISTORY_BYTES), f"{path}: ", "docs/robot.md says what it holds"
+    )
     early = next((n for n, each in enumerate(history.interactions[:-1]) if each.outcome is None), None)
     if early is not None:
         raise UsageError(f"{path}: interactions.{early}: has no outcome though others follow; give it, or take it out")
     return history
+
+
+def parse_json(model: type[Model], data: bytes, source: str, remedy: str) -> Model:
+    """Read a document of JSON, trusting nothing.
+
+    Args:
+        model: what it holds.
+        data: in UTF-8, with or without a byte order mark.
+        source: what a message begins with, such as the file.
+        remedy: what a message ends with: what to write instead.
+
+    Raises:
+        UsageError: it is none, with the first thing that is wrong.
+    """
+    try:
+        text = without_mark(data)
+        found = model.model_validate_json(text)
+        # Of a name that stands twice, pydantic takes the last.
+        json.loads(text, object_pairs_hook=_without_doubles)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        place = shown([".".join(map(str, problem["loc"]))]) if problem["loc"] else "the file"
+        raise UsageError(f"{source}{place}: {problem['msg'][:150]}; {remedy}") from None
+    except ValueError as error:
+        raise UsageError(f"{source}{error}; {remedy}") from None
+    return found
+
+
+def _without_doubles(pairs: list[tuple[str, object]]) -> None:
+    names = [name for name, _ in pairs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"the name {shown(twice[:1])!r} stands twice")
 
 
 def write_history(path: Path, history: History) -> None:

@@ -9,12 +9,7 @@ Files are hostile until checked: bounded in size, finite, never pickled.
 Shapes: M points of a scan, N points that are kept of it.
 """
 
-import io
 import os
-import re
-import warnings
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -24,7 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator
 from scipy.spatial import cKDTree
 
+from adaafford.columns import MAX_SCAN_BYTES, shown, without_mark
+from adaafford.npz import read_npz
 from adaafford.pcd import read_pcd
+from adaafford.ply import read_ply
 from shared import seeds
 from shared.configuration import CameraConfig, StrictModel, parse
 from shared.errors import UsageError
@@ -33,24 +31,25 @@ from shared.geometry import camera_pose, gripper_rotation
 from shared.observation import furthest_first, round_normals, round_points
 from shared.vocabulary import Action, Float, Observation
 
-MAX_SCAN_BYTES = 128 << 20
 MIN_POINTS, MAX_POINTS = 64, 1920 * 1080
+MAX_ROWS = 1 << 23
+"""Of a cloud with the points that were not measured: an image in 4K."""
 POINTS, CANDIDATES = CameraConfig().points, CameraConfig().candidates
 """Kept of a scan, and drawn before that, as in training unless that was told otherwise."""
 MAX_EXTENT_M = 10.0
 """No object that a hand opens is larger; clouds in millimetres are."""
 MAX_OFF_CLOUD_M = 0.05
 """How far from the kept points an action's point may lie; they are a few centimetres apart at the most."""
-FORMATS = (".ply", ".npz", ".pcd")
-UNREADABLE: tuple[type[Exception], ...] = (
-    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, MemoryError, OSError, EOFError),
-    *(RuntimeError, NameError, zipfile.BadZipFile, zlib.error),
-)
-"""What parsers raise when bytes are not what they pretend to be."""
+READERS = {".ply": read_ply, ".npz": read_npz, ".pcd": read_pcd}
 _NORMAL_NEIGHBOURS = 16
-_LINE_ENDS = (*b"\n\r\x0b\x0c\x1c\x1d\x1e\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")
-"""What `str.splitlines` takes for the end of a line, as bytes."""
-_MAX_HEADER_BYTES = 1 << 16
+_MIN_NORMAL = 1e-9
+_MISSING_SHARE = 0.1
+"""What a depth camera misses without anybody being told."""
+_STEEP_DEG = 80.0
+"""Training saw objects from 30 to 60 deg above."""
+
+_SILENT = np.errstate(invalid="ignore", over="ignore")
+"""NumPy warns where it meets certain bits of NaN, and where a number is infinite as a double."""
 
 MAX_COORDINATE = 1e4
 """Of places, metres, and of the numbers of a normal."""
@@ -60,19 +59,23 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """A cloud as it was taken.
+    """A cloud as it was taken, without the points that were not measured.
 
     Attributes:
         points: [M, 3], metres, in the scan's frame.
-        normals: [M, 3], of any length and sign; None: to be estimated.
+        normals: [M, 3], of any length and sign, 0 0 0 where one is to be estimated; None: all of them.
         movable: [M], whether the policy may act on the point; None: everywhere.
         camera: where the camera stood, if the file says.
+        rows: [M], where the points stand in the file or array; None: there are no others.
+        missing: how many points were not measured.
     """
 
     points: Float
     normals: Float | None = None
     movable: NDArray[np.bool_] | None = None
     camera: Vector | None = None
+    rows: NDArray[np.int64] | None = None
+    missing: int = 0
 
 
 class ScanFrame(StrictModel):
@@ -144,38 +147,41 @@ class ScanFrame(StrictModel):
 def read_scan(path: Path) -> Scan:
     """Read a cloud from a PLY, NPZ or PCD file.
 
-    PLY and PCD: x y z, and, where they are there, normals (nx ny nz, or normal_x ...) and `movable`. NPZ: `points`, and
-    optionally `normals`, `movable` and `camera`.
+    PLY and PCD: x y z, and, where they are there, normals (nx ny nz or normal_x ...) and `movable`. NPZ: `points`, and
+    optionally `normals`, `movable` and `camera`. Points that are 0 0 0 or not finite were not measured: they are left
+    out. Normals of this kind are estimated.
 
     Raises:
         UsageError: it is no such file, or holds no cloud of finite points in metres.
-        StoreError: it is no regular file, or too large.
+        StoreError: it cannot be read, or is too large.
     """
     return parse_scan(read_scan_file(path), path)
 
 
 def read_scan_file(path: Path) -> bytes:
     """The bytes of a cloud's file; raises as `read_scan` does."""
-    if path.suffix.lower() not in FORMATS:
-        raise UsageError(f"{path}: not a kind of cloud that is read; allowed: {', '.join(FORMATS)}")
+    if path.suffix.lower() not in READERS:
+        raise UsageError(f"{path}: not a kind of cloud that is read; allowed: {', '.join(READERS)}")
     if not os.path.exists(path):  # noqa: PTH110 - a name too long for the disk is one that is not there.
-        raise UsageError(f"{path}: there is no such file; name a cloud ({', '.join(FORMATS)})")
+        raise UsageError(f"{path}: there is no such file; name a cloud ({', '.join(READERS)})")
+    if not path.is_file():
+        raise UsageError(f"{path}: a folder, pipe or device, and no file; name a cloud ({', '.join(READERS)})")
     return read_bounded(path.resolve(), MAX_SCAN_BYTES)
 
 
+@_SILENT
 def parse_scan(data: bytes, path: Path) -> Scan:
     """A cloud from the bytes of its file; raises as `read_scan` does."""
-    readers = {".ply": _from_ply, ".npz": _from_npz, ".pcd": read_pcd}
     try:
-        columns = readers[path.suffix.lower()](data)
-    except UNREADABLE as error:
-        reason = " ".join(str(error).split())[:100] or type(error).__name__
-        raise UsageError(f"{path}: not readable as {path.suffix[1:].upper()} ({reason}); export it again") from None
+        columns = READERS[path.suffix.lower()](without_mark(data))
+    except ValueError as error:
+        raise UsageError(f"{path}: not readable as {path.suffix[1:].upper()} ({error}); export it again") from None
     return checked_scan(
         columns.get("points"), columns.get("normals"), columns.get("movable"), columns.get("camera"), str(path)
     )
 
 
+@_SILENT
 def checked_scan(
     points: ArrayLike | None,
     normals: ArrayLike | None = None,
@@ -183,44 +189,79 @@ def checked_scan(
     camera: ArrayLike | None = None,
     source: str = "the cloud",
 ) -> Scan:
-    """A scan of arrays from anywhere; points that are not finite are left out, as depth cameras mark what they miss.
+    """A scan of arrays from anywhere.
+
+    Args:
+        points: [M, 3]; those that are 0 0 0 or not finite are left out, as depth cameras mark what they miss.
+        normals: [M, 3]; those that are 0 0 0 or not finite are to be estimated.
+        movable: [M], of 0 and 1, or false and true.
+        camera: [3].
+        source: what messages call it.
 
     Raises:
-        UsageError: shapes do not agree, or too few or too many points are left, or they lie too far apart.
+        UsageError: shapes do not agree, or values are none that are allowed, or too few or too many points are left,
+            or they lie too far apart.
     """
-    try:
-        places = np.asarray(points, dtype=np.float64)
-        facing = None if normals is None else np.asarray(normals, dtype=np.float64)
-        allowed = None if movable is None else np.asarray(movable).astype(bool)
-        stood = None if camera is None else np.asarray(camera, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise UsageError(f"{source}: holds something that is no number; give arrays of numbers") from None
+    places = _array(points, "points", source)
+    facing = None if normals is None else _array(normals, "normals", source)
+    allowed = None if movable is None else _array(movable, "movable", source)
+    stood = None if camera is None else _array(camera, "camera", source)
     if places.ndim != 2 or places.shape[1] != 3:
         raise UsageError(f"{source}: needs points of shape [M, 3]; given {places.shape}")
     for name, value, shape in (("normals", facing, places.shape), ("movable", allowed, places.shape[:1])):
         if value is not None and value.shape != shape:
             raise UsageError(f"{source}: needs {name} of shape {shape}, like its points; given {value.shape}")
-    if stood is not None and (stood.shape != (3,) or not (np.abs(stood) < MAX_COORDINATE).all()):
+    if stood is not None and (stood.shape != (3,) or not _reasonable(stood[None])[0]):
         raise UsageError(f"{source}: needs a camera of three numbers, metres")
-    # Not a number compares as false; and what is far beyond any room is as good as infinite.
-    finite = (np.abs(places) < MAX_COORDINATE).all(axis=1)
-    if facing is not None:
-        finite &= (np.abs(facing) < MAX_COORDINATE).all(axis=1)
-    count = int(finite.sum())
-    if not MIN_POINTS <= count <= MAX_POINTS:
-        raise UsageError(f"{source}: needs {MIN_POINTS} to {MAX_POINTS} finite points; given {count}")
-    places = places[finite]
-    extent = float(np.ptp(places, axis=0).max())
+    if len(places) > MAX_ROWS:
+        raise UsageError(f"{source}: holds {len(places)} points; give at most {MAX_ROWS}, measured or not")
+    rows = np.flatnonzero(_reasonable(places) & places.any(axis=1))
+    if not MIN_POINTS <= len(rows) <= MAX_POINTS:
+        raise UsageError(
+            f"{source}: needs {MIN_POINTS} to {MAX_POINTS} finite points other than 0 0 0; given {len(rows)} of "
+            f"{len(places)}"
+        )
+    measured = places[rows].astype(np.float64)
+    extent = float(np.ptp(measured, axis=0).max())
     if not 1e-3 < extent <= MAX_EXTENT_M:
         raise UsageError(
             f"{source}: measures {extent:g}; give one object, cut out of its surroundings, in metres (at most "
             f"{MAX_EXTENT_M:g})"
         )
     return Scan(
-        places,
-        None if facing is None else facing[finite],
-        None if allowed is None else allowed[finite],
+        measured,
+        None if facing is None else _known_normals(facing[rows]),
+        None if allowed is None else _mask(allowed[rows], source),
         None if stood is None else (float(stood[0]), float(stood[1]), float(stood[2])),
+        None if len(rows) == len(places) else rows,
+        len(places) - len(rows),
+    )
+
+
+def missing_points(scan: Scan) -> str | None:
+    """What to tell a user where a large share of a scan was not measured."""
+    total = len(scan.points) + scan.missing
+    if scan.missing <= _MISSING_SHARE * total:
+        return None
+    return f"{scan.missing} of {total} points were not measured (0 0 0 or not finite) and are left out"
+
+
+def doubtful_up(scan: Scan, frame: ScanFrame) -> str | None:
+    """What to tell a user whose frame looks as if up were wrong: 0 0 1 in the frame of a camera, say.
+
+    Ask only where nobody said what is up: a camera may well look straight down.
+    """
+    place = frame.to_world([frame.camera])[0]
+    elevation = float(np.rad2deg(np.arctan2(place[2], np.hypot(place[0], place[1]))))
+    x, y, z = np.abs(scan.points[:, 0]), np.abs(scan.points[:, 1]), scan.points[:, 2]
+    ahead = frame.camera == (0.0, 0.0, 0.0) and frame.up == (0.0, 0.0, 1.0) and bool((np.maximum(x, y) < z).all())
+    if abs(elevation) <= _STEEP_DEG and not ahead:
+        return None
+    side = "above" if elevation > 0 else "below"
+    up = " ".join(f"{value:g}" for value in frame.up)
+    return (
+        f"with up {up} the camera stands {abs(elevation):.0f} deg {side} the object; in a camera's own frame (x right, "
+        "y down, z forward) up is probably 0 -1 0"
     )
 
 
@@ -241,10 +282,10 @@ def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = PO
     places = frame.to_world(scan.points[kept])
     if np.abs(places).max() > 2 * MAX_EXTENT_M:
         raise UsageError("the cloud lies far from the origin of its frame; all scans of a history share one frame")
-    if scan.normals is not None:
-        normals = scan.normals[kept] @ frame.world_from_scan.T
-    else:
-        normals = _estimated_normals(frame.to_world(scan.points), places)
+    normals = np.zeros_like(places) if scan.normals is None else scan.normals[kept] @ frame.world_from_scan.T
+    unknown = np.linalg.norm(normals, axis=1) <= _MIN_NORMAL
+    if unknown.any():
+        normals[unknown] = _estimated_normals(frame.to_world(scan.points), places[unknown])
     movable = np.ones(len(kept), dtype=bool) if scan.movable is None else scan.movable[kept]
     if not movable.any():
         raise UsageError("the cloud has no movable point; look from another side, or mark the points to act on")
@@ -253,7 +294,7 @@ def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = PO
         normals=round_normals(_facing(normals, places, world_from_camera[:3, 3])),
         part_ids=movable.astype(np.uint8),
         movable=movable,
-        pixels=kept.astype(np.uint32),
+        pixels=(kept if scan.rows is None else scan.rows[kept]).astype(np.uint32),
         world_from_camera=world_from_camera,
     )
 
@@ -278,6 +319,42 @@ def action_at(observation: Observation, frame: ScanFrame, point: Vector, approac
     return Action(nearest, observation.points[nearest].astype(np.float64), rotation)
 
 
+def _array(given: ArrayLike | None, name: str, source: str) -> NDArray[np.generic]:
+    """An array of numbers."""
+    try:
+        array = np.asarray(given)
+    except ValueError:
+        raise UsageError(f"{source}: needs {name} of numbers; given rows of several lengths") from None
+    if array.dtype.kind not in "biuf":
+        raise UsageError(f"{source}: needs {name} of numbers; given {shown([str(array.dtype)])}")
+    return array
+
+
+def _reasonable(vectors: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """[M], whether a vector's numbers are finite; what lies far beyond any room is as good as infinite."""
+    found = np.ones(len(vectors), dtype=bool)
+    for column in vectors.T:
+        found &= (column > -MAX_COORDINATE) & (column < MAX_COORDINATE)
+    return found
+
+
+def _known_normals(normals: NDArray[np.generic]) -> Float | None:
+    """Normals, [M, 3], with 0 0 0 for each that is not finite; None where nothing else is left."""
+    known = np.where(_reasonable(normals)[:, None], normals, 0).astype(np.float64)
+    return known if (np.linalg.norm(known, axis=1) > _MIN_NORMAL).any() else None
+
+
+def _mask(values: NDArray[np.generic], source: str) -> NDArray[np.bool_]:
+    """[M], of 0 and 1 as any kind of number."""
+    wrong = values[(values != 0) & (values != 1)]
+    if len(wrong):
+        raise UsageError(
+            f"{source}: movable holds {float(wrong[0]):g}; allowed are 0, 1, false and true; write 1 for the points to "
+            "act on and 0 for all others"
+        )
+    return values.astype(bool)
+
+
 def _estimated_normals(cloud: Float, points: Float) -> Float:
     """Normals of local planes, [N, 3], of either sign."""
     _, near = cKDTree(cloud).query(points, k=min(_NORMAL_NEIGHBOURS, len(cloud)))
@@ -287,43 +364,8 @@ def _estimated_normals(cloud: Float, points: Float) -> Float:
 
 
 def _facing(normals: Float, points: Float, camera: Float) -> Float:
-    """Unit normals that face the camera; where a normal is nothing, the way to the camera stands in."""
-    to_camera = camera - points
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where(lengths > 1e-9, normals, to_camera)
+    """Unit normals that face the camera."""
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    facing: Float = np.where((normals * to_camera).sum(axis=1, keepdims=True) < 0, -normals, normals)
+    towards = (normals * (camera - points)).sum(axis=1, keepdims=True)
+    facing: Float = np.where(towards < 0, -normals, normals)
     return facing
-
-
-def _from_ply(data: bytes) -> dict[str, NDArray[np.generic]]:
-    from trimesh.exchange.ply import load_ply
-
-    # Every element that a header names becomes an object of its own, though it has no data.
-    if not re.search(rb"\nend_header\s", data[:_MAX_HEADER_BYTES]):
-        raise ValueError(f"has no header, or one of more than {_MAX_HEADER_BYTES} bytes")
-    # In text every line becomes one, whatever the header announces. Bytes would be lowered otherwise than the text is.
-    is_text = "ascii" in data.split(b"\n", 2)[1].decode(errors="replace").lower()
-    if is_text and sum(map(data.count, _LINE_ENDS)) - data.count(b"\r\n") > 2 * MAX_POINTS:
-        raise ValueError("holds too many lines")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # NumPy warns of words among the numbers; what is wrong shows below.
-        loaded = load_ply(io.BytesIO(data), fix_texture=False, skip_materials=True)
-    vertex = loaded["metadata"]["_ply_raw"]["vertex"]["data"]
-    names = set(vertex.dtype.names if isinstance(vertex, np.ndarray) else vertex)
-    found: dict[str, NDArray[np.generic]] = {}
-    for name, fields in (("points", ("x", "y", "z")), ("normals", ("nx", "ny", "nz"))):
-        if set(fields) <= names:
-            found[name] = np.column_stack([np.ravel(vertex[field]) for field in fields])
-    if "movable" in names:
-        found["movable"] = np.ravel(vertex["movable"])
-    return found
-
-
-def _from_npz(data: bytes) -> dict[str, NDArray[np.generic]]:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        # What is small in the archive may be huge outside of it.
-        if sum(entry.file_size for entry in archive.infolist()) > MAX_SCAN_BYTES:
-            raise ValueError(f"unpacks to more than {MAX_SCAN_BYTES} bytes")
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in ("points", "normals", "movable", "camera") if name in arrays.files}

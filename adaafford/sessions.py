@@ -7,16 +7,26 @@ history and the adapted affordance in a heatmap. A session that is ended and beg
 import hashlib
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
 
 from adaafford.heatmaps import heatmap_writer, write_heatmap
-from adaafford.histories import History, TriedOutcome, read_history, write_history
-from adaafford.scans import POINTS, ScanFrame, Vector, observation_of, parse_scan, read_scan, read_scan_file
+from adaafford.histories import History, ScanName, TriedOutcome, parse_json, read_history, write_history
+from adaafford.scans import (
+    POINTS,
+    Scan,
+    ScanFrame,
+    Vector,
+    doubtful_up,
+    missing_points,
+    observation_of,
+    parse_scan,
+    read_scan_file,
+)
 from shared import seeds
 from shared.adaptation import Adapter
 from shared.configuration import StrictModel
@@ -60,24 +70,19 @@ class Step(StrictModel):
 class Request(StrictModel):
     """One line that a robot writes to a session that follows it."""
 
-    cloud: str = Field(min_length=1, max_length=1000)
+    cloud: ScanName
     """A scan of the object as it stands."""
     outcome: TriedOutcome | None = None
     """Of what the last step said; None if it was not done."""
 
     @classmethod
-    def read(cls, line: str) -> "Request":
+    def read(cls, line: bytes) -> "Request":
         """Read a line, trusting nothing.
 
         Raises:
             UsageError: it is no request.
         """
-        try:
-            return cls.model_validate_json(line)
-        except ValidationError as error:
-            problem = error.errors()[0]
-            place = ".".join(map(str, problem["loc"])) or "the line"
-            raise UsageError(f"{place}: {problem['msg'][:150]}; write " + '{"cloud": "scan.ply"}') from None
+        return parse_json(cls, line, "", 'write {"cloud": "scan.ply"}')
 
 
 class Session:
@@ -91,6 +96,7 @@ class Session:
         up: against gravity, in the frame of the scans; the history's where there is one, else 0 0 1.
         camera: where the camera stood, likewise; else what the first scan says, else 0 0 0.
         points: how many of a scan the policy is shown.
+        tell: is given lines on what looks wrong in a scan or its frame, which do not end the session.
     """
 
     def __init__(
@@ -102,14 +108,15 @@ class Session:
         up: Vector | None = None,
         camera: Vector | None = None,
         points: int = POINTS,
+        tell: Callable[[str], object] = lambda line: None,
     ) -> None:
         policy.require("prior", "aap", "aip")
         if files.heatmap is not None:
             heatmap_writer(files.heatmap)
         self._adapter = Adapter(policy)
         self._files, self._budget, self._seed, self._points = files, budget, seed, points
-        self._up, self._camera = up, camera
-        self._observations: dict[str, Observation] = {}
+        self._up, self._camera, self._tell = up, camera, tell
+        self._observations: dict[tuple[str, ScanFrame], Observation] = {}
 
     def step(self, cloud: Path, outcome: TriedOutcome | None = None) -> Step:
         """Take in what happened, and say what to do next.
@@ -123,7 +130,7 @@ class Session:
         """
         begun = time.perf_counter()
         name = self._name_of(cloud)
-        history = self._history(cloud)
+        history = self._history(name)
         if outcome is not None:
             history = history.concluding(outcome)
         known = history.interactions_with(lambda each: self._observe(each.cloud, each.cloud_sha256, history.frame)[0])
@@ -153,20 +160,27 @@ class Session:
             seconds=round(time.perf_counter() - begun, 3),
         )
 
-    def _history(self, cloud: Path) -> History:
+    def _history(self, name: str) -> History:
         """The history that is there, or a new one around a first scan."""
         if os.path.exists(self._files.history):  # noqa: PTH110 - pathlib raises where a name is too long.
             history = read_history(self._files.history)
-            for name, given in (("up", self._up), ("camera", self._camera)):
-                kept = getattr(history.frame, name)
+            for setting, given in (("up", self._up), ("camera", self._camera)):
+                kept = getattr(history.frame, setting)
                 if given is not None and given != kept:
-                    raise UsageError(f"{self._files.history}: was begun with {name} {kept}, now {given}; give the same")
+                    raise UsageError(
+                        f"{self._files.history}: was begun with {setting} {kept}, now {given}; give the same"
+                    )
             return history
         if not self._files.history.parent.is_dir():
             raise UsageError(
                 f"{self._files.history.parent}: there is no such folder; make it, and put the clouds there"
             )
-        frame = ScanFrame.around(read_scan(cloud), self._up or (0.0, 0.0, 1.0), self._camera)
+        path, data, sha256 = self._file(name)
+        scan = parse_scan(data, path)
+        frame = ScanFrame.around(scan, self._up or (0.0, 0.0, 1.0), self._camera)
+        if self._up is None and (doubt := doubtful_up(scan, frame)):
+            self._tell(f"{path}: {doubt}; if so, say it (--up 0 -1 0) and begin another history")
+        self._remember(scan, path, sha256, frame)
         return History(frame=frame)
 
     def _name_of(self, cloud: Path) -> str:
@@ -185,11 +199,20 @@ class Session:
 
         It is made once for the same content, since the networks' work on it is remembered with it.
         """
-        path = self._files.history.parent / name
-        data = read_scan_file(path)
-        sha256 = hashlib.sha256(data).hexdigest()
+        path, data, sha256 = self._file(name)
         if wanted not in (None, sha256):
             raise UsageError(f"{path}: is not the scan that was tried on any more; give every scan a name of its own")
-        if sha256 not in self._observations:
-            self._observations[sha256] = observation_of(parse_scan(data, path), frame, self._seed, self._points)
-        return self._observations[sha256], sha256
+        if (sha256, frame) not in self._observations:
+            self._remember(parse_scan(data, path), path, sha256, frame)
+        return self._observations[sha256, frame], sha256
+
+    def _file(self, name: str) -> tuple[Path, bytes, str]:
+        """A cloud's path, bytes and hash."""
+        path = self._files.history.parent / name
+        data = read_scan_file(path)
+        return path, data, hashlib.sha256(data).hexdigest()
+
+    def _remember(self, scan: Scan, path: Path, sha256: str, frame: ScanFrame) -> None:
+        if missing := missing_points(scan):
+            self._tell(f"{path}: {missing}")
+        self._observations[sha256, frame] = observation_of(scan, frame, self._seed, self._points)

@@ -2,27 +2,25 @@
 
 import io
 import json
-import struct
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from adaafford.heatmaps import colours, write_heatmap
 from adaafford.histories import MAX_TRIES, History, TriedOutcome, read_history, write_history
 from adaafford.pretrained import PRETRAINED_FOLDER, load_policy, only_pretrained, pretrained_names
-from adaafford.scans import ScanFrame, action_at, checked_scan, observation_of, read_scan
-from adaafford.sessions import Session, SessionFiles, Step
+from adaafford.scans import ScanFrame, action_at, checked_scan, observation_of
+from adaafford.sessions import Request, Session, SessionFiles, Step
 from cluster.cli import run as adaafford
 from cluster.commands.adapt import MAX_LINE_BYTES, lines_of
 from shared.adaptation import Adapter, frames_in_view
-from shared.errors import AdaAffordError, StoreError, UsageError
+from shared.errors import StoreError, UsageError
 from shared.geometry import camera_pose, gripper_rotation, points_in_view
 from shared.networks.configuration import NetworkConfig
 from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
@@ -121,154 +119,11 @@ def test_an_action_far_from_the_cloud_is_refused() -> None:
 # Files.
 
 
-def ply(points: Float, encoding: str = "ascii", extra: bool = False) -> bytes:
-    names = ["x", "y", "z", *(["nx", "ny", "nz", "movable"] if extra else [])]
-    values = np.column_stack([points, np.tile([-1.0, 0, 0, 1], (len(points), 1))]) if extra else points
-    header = f"ply\nformat {encoding} 1.0\nelement vertex {len(points)}\n"
-    header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
-    if encoding == "ascii":
-        return (header + "\n".join(" ".join(map(repr, row.tolist())) for row in values) + "\n").encode()
-    return header.encode() + values.astype("<f4").tobytes()
-
-
-def pcd(points: Float, encoding: str = "ascii") -> bytes:
-    header = (
-        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z _ rgb\nSIZE 4 4 4 1 4\nTYPE F F F U U\nCOUNT 1 1 1 3 1\n"
-        f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0.5 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {encoding}\n"
-    )
-    if encoding == "ascii":
-        rows = "\n".join(" ".join([*map(repr, row.tolist()), "0 0 0 255"]) for row in points)
-        return (header + rows + "\n").encode()
-    return header.encode() + b"".join(struct.pack("<fff3BI", *row, 0, 0, 0, 255) for row in points)
-
-
-def test_every_format_gives_the_same_points(tmp_path: Path) -> None:
-    points = front(200)
-    np.savez(tmp_path / "a.npz", points=points)
-    (tmp_path / "b.ply").write_bytes(ply(points))
-    (tmp_path / "c.ply").write_bytes(ply(points, "binary_little_endian", extra=True))
-    (tmp_path / "d.pcd").write_bytes(pcd(points))
-    (tmp_path / "e.pcd").write_bytes(pcd(points, "binary"))
-    for path in sorted(tmp_path.iterdir()):
-        np.testing.assert_allclose(read_scan(path).points, points, atol=1e-6, err_msg=path.name)
-    full = read_scan(tmp_path / "c.ply")
-    assert full.normals is not None
-    assert full.movable is not None
-    assert full.movable.all()
-    assert read_scan(tmp_path / "e.pcd").camera == (0.5, 0.0, 0.0)
-
-
-def test_what_a_depth_camera_missed_is_left_out() -> None:
-    points = np.concatenate([front(100), np.full((40, 3), np.nan), [[1e300, 0, 0]]])
-    scan = checked_scan(points, normals=np.ones_like(points), movable=np.arange(141) % 2)
-    assert len(scan.points) == 100
-    assert scan.normals is not None
-    assert len(scan.normals) == 100
-    assert scan.movable is not None
-    assert scan.movable.sum() == 50
-
-
-def packed(**held: object) -> bytes:
-    data = io.BytesIO()
-    np.savez_compressed(data, **held)  # type: ignore[arg-type]
-    return data.getvalue()
-
-
-def bomb() -> bytes:
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("points.npy", "w") as entry:
-        for _ in range(136):
-            entry.write(bytes(1 << 20))
-    return data.getvalue()
-
-
-def lying_npy() -> bytes:
-    """An array that announces a hundred gigabytes and holds none."""
-    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (5000000000, 3), }"
-    header += b" " * (64 - (len(header) + 11) % 64) + b"\n"
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w") as archive:
-        archive.writestr("points.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
-    return data.getvalue()
-
-
-HOSTILE = {
-    "pickle.npz": packed(points=np.array([{"a": print}] * 99, dtype=object)),
-    "bomb.npz": bomb(),
-    "lying.npz": lying_npy(),
-    "empty.npz": packed(),
-    "words.npz": packed(points=np.array([["a", "b", "c"]] * 99)),
-    "flat.npz": packed(points=np.zeros((99, 2))),
-    "few.npz": packed(points=front(10)),
-    "nan.npz": packed(points=np.full((99, 3), np.nan)),
-    "point.npz": packed(points=np.zeros((99, 3))),
-    "millimetres.npz": packed(points=1000 * front(99)),
-    "normals.npz": packed(points=front(99), normals=np.zeros((98, 3))),
-    "camera.npz": packed(points=front(99), camera=np.array([np.nan, 0, 0])),
-    "zip.npz": b"PK\x03\x04 cut off",
-    "nothing.ply": b"",
-    "other.ply": b"solid stl",
-    "endless.ply": b"ply\nformat ascii 1.0\nelement vertex 5\n",
-    "huge.ply": ply(front(99), "binary_little_endian").replace(b"vertex 99", b"vertex 999999999999"),
-    "words.ply": ply(front(99)).replace(b"0.9", b"zero"),
-    "cut.ply": ply(front(99), "binary_little_endian")[:-8],
-    "elements.ply": ply(front(99)).replace(b"end_", b"".join(b"element e%d 0\n" % n for n in range(9999)) + b"end_"),
-    "hollow.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n",
-    "faces.ply": b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nend_header\n3 0 1 2\n",
-    "header.pcd": b"FIELDS x y z\n" * 2000,
-    "huge.pcd": pcd(front(99), "binary").replace(b"POINTS 99", b"POINTS 99999999999"),
-    "compressed.pcd": pcd(front(99)).replace(b"DATA ascii", b"DATA binary_compressed"),
-    "words.pcd": pcd(front(99)).replace(b"0.9", b"zero"),
-    "missing.pcd": pcd(front(99)).replace(b"FIELDS x y z", b"FIELDS x y w"),
-    "twice.pcd": pcd(front(99)).replace(b"FIELDS x y z", b"FIELDS x x z"),
-    "type.pcd": pcd(front(99)).replace(b"TYPE F F F", b"TYPE O F F"),
-    "cloud.xyz": b"0 0 0\n",
-}
-
-
-@pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_cloud_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_bytes(HOSTILE[name])
-    with pytest.raises(AdaAffordError) as refused:
-        read_scan(tmp_path / name)
-    assert name in str(refused.value)
-    assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize("end", ["\n", "\r", "\x0b", "\x85", "\u2028"])
-@pytest.mark.parametrize("name", [b"ascii", b"ASCII", b"   Ascii", "asci\u0130".encode()])
-def test_a_text_of_too_many_lines_is_refused_unread(
-    name: bytes, end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("adaafford.scans.MAX_POINTS", 100)
-    whole = ply(front(99)).replace(b"format ascii", b"format " + name)
-    (tmp_path / "fits.ply").write_bytes(whole)
-    assert len(read_scan(tmp_path / "fits.ply").points) == 99
-    (tmp_path / "long.ply").write_bytes(whole + f"0{end}".encode() * 200)
-    with pytest.raises(UsageError, match="too many lines"):
-        read_scan(tmp_path / "long.ply")
-
-
 def test_lines_that_are_too_long_are_one_line_each() -> None:
     long = b"x" * (3 * MAX_LINE_BYTES)
     found = list(lines_of(io.BytesIO(long + b"\n{}\n" + long)))
     assert [line[:3] for line in found] == [b"xxx", b"{}\n", b"xxx"]
     assert [len(line) >= MAX_LINE_BYTES for line in found] == [True, False, True]
-
-
-@settings(max_examples=60, deadline=None)
-@given(kind=st.sampled_from(["ply", "pcd", "npz"]), place=st.integers(0, 400), byte=st.integers(0, 255))
-def test_a_flipped_byte_is_read_or_refused(
-    kind: str, place: int, byte: int, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    whole = bytearray({"ply": ply(front(70)), "pcd": pcd(front(70), "binary"), "npz": packed(points=front(70))}[kind])
-    whole[place] = byte
-    path = tmp_path_factory.getbasetemp() / f"flipped.{kind}"
-    path.write_bytes(whole)
-    try:
-        assert np.isfinite(read_scan(path).points).all()
-    except AdaAffordError as refused:
-        assert "\n" not in str(refused)
 
 
 def test_a_history_comes_back(tmp_path: Path) -> None:
@@ -555,6 +410,51 @@ def test_what_was_tried_is_remembered_though_its_hash_was_left_out(policy_folder
     lasting.step(later)
     assert len(before) == 2
     assert all(lasting._observations[key] is observation for key, observation in before.items())
+
+
+def test_what_looks_wrong_in_a_scan_is_said_once_and_changes_nothing(
+    policy_folder: Path, scan: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = front()
+    points = np.stack([-points[:, 1], -points[:, 2], points[:, 0]], axis=1)
+    points[::2] = 0
+    np.savez(scan, points=points)
+    where = ["--cloud", str(scan), "--history", str(scan.parent / "history.json"), "--policy", str(policy_folder)]
+    assert adaafford(["adapt", *where]) == 0
+    first = capsys.readouterr()
+    up, missing = first.err.splitlines()
+    assert "up is probably 0 -1 0" in up
+    assert "1500 of 3000 points were not measured" in missing
+    assert read_history(scan.parent / "history.json").frame.up == (0.0, 0.0, 1.0)
+    assert adaafford(["adapt", *where]) == 0
+    again = capsys.readouterr()
+    assert again.err.splitlines() == [missing], "the history says what is up"
+    assert json.loads(again.out) | {"seconds": 0} == json.loads(first.out) | {"seconds": 0}
+    other = [*where[:3], str(scan.parent / "other.json"), *where[4:], "--up", "0", "0", "1"]
+    assert adaafford(["adapt", *other]) == 0
+    assert capsys.readouterr().err.splitlines() == [missing]
+
+
+@pytest.mark.parametrize("line", [b'\xef\xbb\xbf{"cloud": "scan.ply"}', b'{"cloud": "scan.ply", "outcome": null}\r\n'])
+def test_a_request_is_read(line: bytes) -> None:
+    assert Request.read(line) == Request(cloud="scan.ply")
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (b"\xff\xfe{\0", "UTF-16"),
+        (b'{"cloud": "a.ply", "cloud": "b.ply"}', "the name 'cloud' stands twice"),
+        (b'{"cloud": "a\\u001b.ply"}', "cloud: Value error, needs a name without control characters"),
+        (b'{"cloud": "a.ply", "outcome": {"motion": NaN}}', "outcome.motion"),
+        (b"[" * 60_000, "Invalid JSON"),
+    ],
+)
+def test_a_request_that_is_none_is_refused_in_one_line(line: bytes, expected: str) -> None:
+    with pytest.raises(UsageError, match=r'write {"cloud": "scan.ply"}') as refused:
+        Request.read(line)
+    assert expected in str(refused.value)
+    assert str(refused.value).isprintable()
 
 
 def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(

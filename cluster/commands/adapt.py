@@ -77,7 +77,7 @@ def main(args: list[str]) -> int:
 
     files = SessionFiles(command.history, command.out or command.history.parent / "heatmap.ply")
     policy = load_policy(command.policy or only_pretrained())
-    session = Session(policy, files, command.budget, command.seed, command.up, command.camera, command.points)
+    session = Session(policy, files, command.budget, command.seed, command.up, command.camera, command.points, _say)
     told = {"motion": command.outcome, "success": command.success, "kind": command.kind}
     outcome = None if command.outcome is None else parse(TriedOutcome, told, "--outcome")
     print(session.step(command.cloud, outcome).model_dump_json(), flush=True)
@@ -95,6 +95,10 @@ def lines_of(stream: BinaryIO) -> Iterator[bytes]:
         yield line
 
 
+def _say(line: str) -> None:
+    print(f"adaafford: {line}", file=sys.stderr, flush=True)
+
+
 def _follow(session: "Session", folder: Path) -> None:
     """Answer each line of the standard input by a line; one that cannot be answered, by its reason."""
     from adaafford.sessions import Request
@@ -103,7 +107,7 @@ def _follow(session: "Session", folder: Path) -> None:
         try:
             if len(line) >= MAX_LINE_BYTES:
                 raise UsageError(f"a line of more than {MAX_LINE_BYTES} bytes; " + 'write {"cloud": "scan.ply"}')
-            request = Request.read(line.decode(errors="replace"))
+            request = Request.read(line)
             print(session.step(folder / request.cloud, request.outcome).model_dump_json(), flush=True)
         except AdaAffordError as error:
             print(json.dumps({"error": str(error)}), flush=True)
