@@ -13,6 +13,8 @@ from typing import NoReturn
 from cluster.logs import configure
 from shared.errors import AdaAffordError
 
+NARROW = 20
+"""Columns of a terminal that nobody has."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as a shell has it."""
 
@@ -52,6 +54,9 @@ def main() -> NoReturn:
 def begin_process() -> None:
     """Set up logging and signals of a process of ours."""
     configure(os.environ)
+    if os.environ.get("COLUMNS", "").isdecimal() and int(os.environ["COLUMNS"]) < NARROW:
+        # Nothing would be printed at all at 0, which some terminals say where they do not know.
+        del os.environ["COLUMNS"]
     # As Ctrl-C does, so that workers and learners are ended in an orderly way.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
 
