@@ -129,3 +129,12 @@ def test_a_terminal_without_columns_is_written_to(columns: str) -> None:
     told = {**os.environ, "COLUMNS": columns}
     done = subprocess.run([sys.executable, "-c", script], env=told, capture_output=True, text=True, check=True)
     assert done.stdout == "all of it\n"
+
+
+def test_threads_that_wait_for_each_other_do_not_keep_a_busy_processor_for_long() -> None:
+    script = "from cluster.cli import begin_process; begin_process(); import torch"
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
+    for given, spins in (({}, "30000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "passive"}, "0")):
+        told = {**kept, **given, "OMP_DISPLAY_ENV": "verbose"}
+        done = subprocess.run([sys.executable, "-c", script], env=told, capture_output=True, text=True, check=True)
+        assert f"GOMP_SPINCOUNT = '{spins}'" in done.stderr
