@@ -17,6 +17,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from cluster.fleet import Fleet, SerialFleet, WorkerFactory
 from collector.guard import Limits
 from shared.errors import StoreError, UsageError, WorkerError
@@ -28,6 +30,8 @@ OBJECT_STORE_BYTES = 128 << 20
 """Only weights and receipts travel, so the smallest object store that Ray likes is ample."""
 ANSWER_S = 5.0
 """How long a cluster may take to answer."""
+AGENTS_S = 10.0
+"""How long Ray's agents, which write to the session's folder, may take to end after it."""
 RAY_PREFIX = "RAY_"
 """Of the environment variables that Ray reads."""
 
@@ -40,6 +44,9 @@ _ENVIRONMENT = {
     "MKL_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
 }
+_SYSTEM = {"gcs_rpc_server_reconnect_timeout_s": 20}
+"""The control store of a private session never comes back: it is given up after 20 s, not after 60. Not by a variable,
+which Ray's native part may fail to parse where it is loaded after SAPIEN."""
 _ADDRESS = re.compile(r"(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
 _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 _SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
@@ -194,17 +201,16 @@ def _private_session(workers: int) -> Iterator[None]:
     except FileNotFoundError:
         raise UsageError("the current folder has been removed; change into one that is there") from None
     # For as long as the session lives, since Ray reads some of them late.
-    foreign = dict.fromkeys(name for name in os.environ if name.startswith(RAY_PREFIX))
-    with _changed_environment(foreign), _session_folder() as folder:
+    with without_foreign_settings(), _session_folder() as folder:
         token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
-        # The control store of a private session never comes back: it is given up after 20 s, not after 60.
-        haste = {"RAY_gcs_rpc_server_reconnect_timeout_s": "20"}
-        with _changed_environment({**_ENVIRONMENT, **token, **haste}), _ray() as ray:
+        with _changed_environment({**_ENVIRONMENT, **token}), _ray() as ray:
             _start_on_loopback(workers, folder)
         try:
             yield
         finally:
+            processes = _processes_of_ray()
             ray.shutdown()
+            psutil.wait_procs(processes, AGENTS_S)
 
 
 def _start_on_loopback(workers: int, folder: Path) -> None:
@@ -230,6 +236,7 @@ def _start_on_loopback(workers: int, folder: Path) -> None:
             _node_ip_address="127.0.0.1",
             _temp_dir=str(folder),
             _plasma_directory=None if _has_shared_memory() else str(folder),
+            _system_config=_SYSTEM,
         )
     except Exception as error:
         # Ray has no class of its own for a session that does not come up in its 30 s.
@@ -238,6 +245,15 @@ def _start_on_loopback(workers: int, folder: Path) -> None:
         ) from error
     finally:
         ray_constants.ENABLE_RAY_CLUSTER = clusters
+
+
+def _processes_of_ray() -> list[psutil.Process]:
+    found = []
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            if process.name().startswith("ray"):
+                found.append(process)
+    return found
 
 
 def _has_shared_memory() -> bool:
@@ -274,7 +290,8 @@ def _owner_is_gone(folder: Path) -> bool:
     try:
         return is_gone(read_bounded(folder / _OWNER_FILE, 1 << 10).decode(errors="replace"))
     except StoreError:
-        return False
+        # None, so this is no folder of a session any more: agents of one that was killed have made it again.
+        return True
 
 
 def _remove_session(folder: Path) -> None:
@@ -282,6 +299,13 @@ def _remove_session(folder: Path) -> None:
     with suppress(FileNotFoundError):  # Another driver was faster.
         folder.rename(old)
         remove_tree(old)
+
+
+@contextmanager
+def without_foreign_settings() -> Iterator[None]:
+    """The environment has no variables for Ray, which other sessions, nodes and jobs leave there."""
+    with _changed_environment(dict.fromkeys(name for name in os.environ if name.startswith(RAY_PREFIX))):
+        yield
 
 
 @contextmanager
