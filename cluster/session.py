@@ -151,8 +151,9 @@ def _cluster(address: str) -> Iterator[None]:
                 ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
         except Exception as error:
             # What Ray raises depends on what answers: another program, another version, one that wants a token.
+            said = " ".join(str(getattr(error, "strerror", None) or error).split())[:300]
             raise UsageError(
-                f"no Ray cluster answers at '{named}' ({_line(error)}); start one, or leave the address out"
+                f"no Ray cluster answers at '{named}' ({said}); start one, or leave the address out"
             ) from error
     try:
         yield
@@ -240,9 +241,8 @@ def _start_on_loopback(workers: int, folder: Path) -> None:
         )
     except Exception as error:
         # Ray has no class of its own for a session that does not come up in its 30 s.
-        raise WorkerError(
-            f"Ray did not start ({_line(error)}); run the same command again, or with --workers 0"
-        ) from error
+        said = str(error).partition("\n")[0]
+        raise WorkerError(f"Ray did not start ({said}); run the same command again, or with --workers 0") from error
     finally:
         ray_constants.ENABLE_RAY_CLUSTER = clusters
 
@@ -346,8 +346,3 @@ def _ray() -> Iterator[Any]:
 def _to_log(data: dict[str, Any], ignore_prefix: bool = False) -> None:
     """Take what raylets would print on our terminal: the end of an actor, say, which we report ourselves."""
     logger.debug("%s", " ".join(data.get("lines", ())))
-
-
-def _line(error: Exception) -> str:
-    """What an error says, in a line of bounded length."""
-    return " ".join(str(getattr(error, "strerror", None) or error).split())[:300]
