@@ -27,6 +27,7 @@ from collector.pieces import MAX_ENCODED_BYTES, decode, encode
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.files import read_bounded, remove_tree, write_atomically
 from shared.interpreter import PYTHON, own_environment
+from shared.private import private_folder
 
 LIMIT_S = 120.0
 """CPU time for one mesh; the largest of published objects take some 20 s."""
@@ -38,10 +39,30 @@ SLACK = 0.1
 
 
 def cache_folder() -> Path:
-    """Where decompositions are kept: below $XDG_CACHE_HOME, or else ~/.cache."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    # The specification has relative paths ignored.
-    return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "adaafford" / "pieces"
+    """Where decompositions are kept: below $XDG_CACHE_HOME or ~/.cache, or else in this user's temporary folder.
+
+    Raises:
+        UsageError: none of them can be written.
+    """
+    # Without a home this gives "~", a relative path.
+    home = Path(os.environ.get("HOME", os.path.expanduser("~")))  # noqa: PTH111
+    for base in (Path(os.environ.get("XDG_CACHE_HOME", "")), home / ".cache"):
+        folder = base / "adaafford" / "pieces"
+        # The specification has relative paths ignored.
+        if folder.is_absolute() and _can_be_written(folder):
+            return folder
+    try:
+        return private_folder("pieces")
+    except UsageError as error:
+        raise UsageError(f"{error}, or XDG_CACHE_HOME to one for the cache of decomposed meshes") from None
+
+
+def _can_be_written(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
 
 
 class Decomposer:

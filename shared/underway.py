@@ -8,9 +8,11 @@ wrote it, so that none is ever taken for another's, however many have tried the 
 the disk: a breadcrumb matters after the end of a process, not of a machine.
 
 Of a store in a bucket the breadcrumbs lie there too, but last words cannot: a handler of signals writes to an open file
-and no further. They stay on the worker's machine, and a driver on another one takes a crash for a loss.
+and no further. They stay on the worker's machine, in a folder of its user alone (`shared.private`), and a driver on
+another one takes a crash for a loss.
 """
 
+import hashlib
 import os
 import re
 from dataclasses import dataclass
@@ -23,6 +25,7 @@ from pydantic import Field, ValidationError
 from shared.configuration import StrictModel
 from shared.errors import StoreError
 from shared.files import is_abandoned, is_gone, process_name, read_bounded
+from shared.private import private_folder
 
 if TYPE_CHECKING:
     from shared.store.place import Place
@@ -52,7 +55,8 @@ class Underway:
     """What is under way in one store.
 
     Attributes:
-        folder: of the breadcrumbs and last words; of a store in a bucket, one on this machine for the last words alone.
+        folder: of the breadcrumbs and last words; None: of a store in a bucket, whose last words each machine keeps in
+            its user's private folder.
         url: of a store in a bucket.
 
     Example:
@@ -60,7 +64,7 @@ class Underway:
         underway.crumb_of(process), underway.fault_of(process)      # the driver, once that process has ended
     """
 
-    folder: Path
+    folder: Path | None
     url: str = ""
 
     def leave(self, crumb: Crumb) -> None:
@@ -77,16 +81,22 @@ class Underway:
         try:
             _overwrite(file, crumb.model_dump_json().encode())
         except FileNotFoundError:
-            self.folder.mkdir(exist_ok=True)
+            file.parent.mkdir(exist_ok=True)
             _overwrite(file, crumb.model_dump_json().encode())
         except OSError:
             file.unlink(missing_ok=True)
             raise
 
     def open_fault_log(self) -> IO[bytes]:
-        """A file for the last words of this process, as `faulthandler` writes them."""
-        self.folder.mkdir(exist_ok=True)
-        return self._file(process_name(), _FAULT).open("wb", buffering=0)
+        """A file for the last words of this process, as `faulthandler` writes them.
+
+        Raises:
+            UsageError: there is no private folder on this machine, for a store in a bucket.
+            OSError: the file cannot be written.
+        """
+        file = self._file(process_name(), _FAULT)
+        file.parent.mkdir(exist_ok=True)
+        return os.fdopen(_open(file, os.O_TRUNC), "wb", buffering=0)
 
     def crumb_of(self, process: str) -> Crumb | None:
         """What a process does, or did when it ended; None if it left no breadcrumb, or half of one."""
@@ -97,10 +107,7 @@ class Underway:
 
     def crumbs(self) -> dict[str, Crumb]:
         """What each process does that has not been forgotten, by its name."""
-        if self.url:
-            names = _place(self.url).names(UNDERWAY_FOLDER)
-        else:
-            names = sorted(file.name for file in self.folder.iterdir()) if self.folder.is_dir() else []
+        names = _place(self.url).names(UNDERWAY_FOLDER) if self.url else sorted(file.name for file in self._files())
         processes = [name.removesuffix(_CRUMB) for name in names if name.endswith(_CRUMB)]
         found = {process: self.crumb_of(process) for process in processes}
         return {process: crumb for process, crumb in found.items() if crumb is not None}
@@ -119,16 +126,26 @@ class Underway:
     def sweep(self) -> int:
         """Remove what ended processes left, as far as that can be told; returns how many files that was."""
         crumbs = [process for process in self.crumbs() if is_gone(process)] if self.url else []
-        files = [f for f in self.folder.iterdir() if is_abandoned(f.stem, f)] if self.folder.is_dir() else []
+        files = [file for file in self._files() if is_abandoned(file.stem, file)]
         for process in crumbs:
             _place(self.url).remove(_key(process))
         for file in files:
             file.unlink(missing_ok=True)
         return len(crumbs) + len(files)
 
+    def _home(self) -> Path:
+        """The folder of this machine's files."""
+        if self.folder is not None:
+            return self.folder
+        return private_folder(f"{UNDERWAY_FOLDER}-{hashlib.sha256(self.url.encode()).hexdigest()[:16]}")
+
+    def _files(self) -> list[Path]:
+        home = self._home()
+        return list(home.iterdir()) if home.is_dir() else []
+
     def _file(self, process: str, suffix: str) -> Path:
         # Not `with_suffix`: a host's name may hold dots.
-        return self.folder / f"{process}{suffix}"
+        return self._home() / f"{process}{suffix}"
 
     def _read_crumb(self, process: str) -> bytes:
         if not self.url:
@@ -163,11 +180,18 @@ def _overwrite(file: Path, data: bytes) -> None:
     # Neither truncated nor renamed over: file systems take either for a wish to have it on the disk at once, which
     # costs milliseconds. Blanks cover what was there before, and JSON ignores them.
     assert len(data) <= _CRUMB_BYTES
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+    descriptor = _open(file)
     try:
         os.write(descriptor, data.ljust(_CRUMB_BYTES))
     finally:
         os.close(descriptor)
+
+
+def _open(file: Path, flags: int = 0) -> int:
+    """Open a file of this process to write: others may write to a store, and a link could lead anywhere."""
+    # A pipe in its place would block for ever.
+    flags |= os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    return os.open(file, flags, 0o644)
 
 
 def summary_of(words: str) -> str:

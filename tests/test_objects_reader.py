@@ -2,7 +2,6 @@
 
 import json
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -286,14 +285,12 @@ def test_what_cannot_be_used_is_refused_with_one_line(folder: Path, name: str) -
     spoil, expected = HOSTILE[name]
     read_object(folder)
     spoil(folder)
-    begun = time.perf_counter()
     with pytest.raises(ObjectError) as refusal:
         read_object(folder)
     message = str(refusal.value)
     assert expected in message
     assert "\n" not in message
     assert len(message) < 500
-    assert time.perf_counter() - begun < 5
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None:

@@ -112,7 +112,15 @@ def check_picture(flag: str, path: Path | None) -> None:
 
 
 def main(args: list[str]) -> int:
-    """Dispatch."""
+    """Run one of the benchmarks."""
+    from cluster.session import without_foreign_settings
+
+    # Some import Ray, which reads its settings then, before they start a session.
+    with without_foreign_settings():
+        return _dispatch(args)
+
+
+def _dispatch(args: list[str]) -> int:
     match args[:1]:
         case ["fidelity"]:
             return _fidelity(parse_flags(FidelityCommand, args[1:], "bench fidelity").settings)

@@ -7,12 +7,10 @@ clouds = store.read_observations(shard_id)
 """
 
 import difflib
-import hashlib
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
-from tempfile import gettempdir
 from typing import Any
 
 import pyarrow as pa
@@ -367,11 +365,7 @@ class Store:
     @property
     def underway(self) -> Underway:
         """Where workers leave their breadcrumbs."""
-        if is_url(self.where):
-            # Last words come from a handler of signals, which knows files alone.
-            name = f"adaafford-underway-{hashlib.sha256(self.where.encode()).hexdigest()[:16]}"
-            return Underway(Path(gettempdir()) / name, self.where)
-        return Underway(self.path / UNDERWAY_FOLDER)
+        return Underway(None, self.where) if is_url(self.where) else Underway(self.path / UNDERWAY_FOLDER)
 
     def _committed_shard(self, shard_id: str) -> Folder:
         folder = reader.shard_folder(self.place, shard_id)

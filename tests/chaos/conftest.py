@@ -68,7 +68,7 @@ def s3_environment(s3_endpoint: str) -> dict[str, str]:
 
 @pytest.fixture(scope="session")
 def ray_folder() -> Iterator[Path]:
-    """For Ray's sessions; not within a test's folder, since paths of sockets may have no more than 107 letters."""
+    """For temporary files and Ray's sessions; its name is short, as that of sockets has to be."""
     folder = Path(tempfile.mkdtemp(prefix="ada", dir="/tmp"))
     yield folder
     shutil.rmtree(folder)

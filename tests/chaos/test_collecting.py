@@ -66,7 +66,7 @@ def test_any_process_of_a_session_of_its_own(
     counts: Counts,
     everybody: list[Marked],
 ) -> None:
-    environment = {"RAY_TMPDIR": str(ray_folder), "RAY_gcs_rpc_server_reconnect_timeout_s": "5"}
+    environment = {"TMPDIR": str(ray_folder)}
     siege = Siege(name, IN_SESSION, tmp_path, seed, counts, everybody, lambda: Marked(environment), most=7)
     siege.lay(collecting(base, "--workers", "2", "--rollouts", "40", "--objects", str(objects)))
 

@@ -78,7 +78,7 @@ def test_a_learner_beside_collection(
         return Trial([collect, learn], lambda: (witness.look(), of_learner.look()), result)
 
     victims = {Role.LEARNER: 5.0, Role.DRIVER: 4.0, Role.ACTOR: 3.0, Role.HEAD: 1.0}
-    environment = {"RAY_TMPDIR": str(ray_folder)}
+    environment = {"TMPDIR": str(ray_folder)}
     siege = Siege(
         BESIDE, victims, tmp_path, seed, counts, everybody, lambda: Marked(environment), most=7, within_s=10.0
     )
@@ -100,6 +100,6 @@ def test_a_whole_campaign(ray_folder: Path, tmp_path: Path, seed: int, counts: C
         return Trial([command], lambda: [witness.look() for witness in witnesses], result)
 
     victims = {Role.LEARNER: 3.0, Role.DRIVER: 3.0, Role.ACTOR: 3.0, Role.HEAD: 1.0, Role.ALL: 1.0}
-    environment = {"RAY_TMPDIR": str(ray_folder)}
+    environment = {"TMPDIR": str(ray_folder)}
     siege = Siege(WHOLE, victims, tmp_path, seed, counts, everybody, lambda: Marked(environment), within_s=20.0)
     siege.lay(trial)
