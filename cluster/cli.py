@@ -12,6 +12,7 @@ from typing import NoReturn
 
 from cluster.logs import configure
 from shared.errors import AdaAffordError
+from shared.plain import plain
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as a shell has it."""
@@ -94,7 +95,7 @@ def _interrupted(args: list[str]) -> int:
     """Say how to go on after Ctrl-C."""
     hint = "; what is committed stays, and the same command goes on" if args[0] in RESUMABLE else ""
     print(
-        f"adaafford: interrupted{hint}: adaafford {' '.join(args)}" if hint else "adaafford: interrupted",
+        f"adaafford: interrupted{hint}: adaafford {plain(' '.join(args))}" if hint else "adaafford: interrupted",
         file=sys.stderr,
     )
     return INTERRUPTED
@@ -102,5 +103,5 @@ def _interrupted(args: list[str]) -> int:
 
 def _complain(message: str, code: int) -> int:
     """Print one line."""
-    print(f"adaafford: {' '.join(message.split())}", file=sys.stderr)
+    print(f"adaafford: {plain(' '.join(message.split()))}", file=sys.stderr)
     return code

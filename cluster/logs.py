@@ -10,11 +10,21 @@ import logging
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+from shared.plain import plain
+
 VARIABLE = "ADAAFFORD_LOG"
 OURS = ("cluster", "collector", "learner", "shared")
 """Packages of which machines are told more than warnings."""
 FIELDS = ("plan", "policy", "shard", "rollout", "worker", "interactions", "successes", "seconds", "reason")
 """What a line may be about."""
+
+
+class Lines(logging.Formatter):
+    """A record as one line for people."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
+        """See `logging.Formatter.formatMessage`."""
+        return plain(super().formatMessage(record))
 
 
 class JsonLines(logging.Formatter):
@@ -40,11 +50,9 @@ def configure(environment: Mapping[str, str]) -> None:
     Args:
         environment: ADAAFFORD_LOG=json asks for JSON lines, and for more of them.
     """
-    if environment.get(VARIABLE) != "json":
-        logging.basicConfig(format="adaafford: %(message)s", level=logging.WARNING)
-        return
+    as_json = environment.get(VARIABLE) == "json"
     handler = logging.StreamHandler()
-    handler.setFormatter(JsonLines())
+    handler.setFormatter(JsonLines() if as_json else Lines("adaafford: %(message)s"))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
-    for name in OURS:
+    for name in OURS if as_json else ():
         logging.getLogger(name).setLevel(logging.INFO)

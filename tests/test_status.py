@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from cluster.cli import run
 from cluster.commands.status import as_json, table
 from cluster.ledger import Ledger
-from cluster.logs import JsonLines, configure
+from cluster.logs import JsonLines, Lines, configure
 from cluster.progress import RECENT_S, CollectionProgress
 from cluster.standing import standing_of
 from cluster.status import SILENT_S, DriverStatus, StatusKeeper, read_status
@@ -209,7 +209,8 @@ def test_logging_is_for_people_unless_machines_are_asked_for(monkeypatch: pytest
     given: list[dict[str, object]] = []
     monkeypatch.setattr(logging, "basicConfig", lambda **options: given.append(options))
     configure({})
-    assert "format" in given[0]
+    (handler,) = given[0]["handlers"]  # type: ignore[misc]
+    assert isinstance(handler.formatter, Lines)
     levels = {name: logging.getLogger(name).level for name in ("cluster", "collector", "learner", "shared")}
     try:
         configure({"ADAAFFORD_LOG": "json"})
