@@ -320,6 +320,18 @@ def test_crashes_hangs_and_kills_cost_themselves_alone_on_ray(tmp_path: Path) ->
     assert reasons[10].startswith("its process was lost without a word")
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(("mishap", "said"), [("raise", "3 different rollouts failed"), ("library", "failed 3 times")])
+def test_a_broken_environment_ends_the_collection_on_ray(tmp_path: Path, mishap: str, said: str) -> None:
+    store = new_store(tmp_path)
+    with fleets(2, Limits()) as make:
+        fleet = make(partial(MisbehavingWorker, store.path, dict.fromkeys(range(ROLLOUTS), mishap)), store.underway)
+        with pytest.raises(WorkerError, match=said):
+            collect(store, Plan(setting=store.setting), ROLLOUTS, 1, lambda: fleet, OBJECTS)
+    assert all(not shard.quarantined for shard in store.committed())
+
+
 def test_a_replayed_rollout_crashes_before_ones_eyes(tmp_path: Path) -> None:
     store = new_store(tmp_path)
     fill(store, {5: "raise"})
