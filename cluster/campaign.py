@@ -34,6 +34,7 @@ from cluster.training import Trainer
 from shared.errors import UsageError
 from shared.files import write_atomically
 from shared.methods import baselines_of
+from shared.plain import plain
 from shared.plan import Plan, Setting
 from shared.store import Store
 from shared.store.provenance import changed_versions, software_versions
@@ -199,4 +200,4 @@ class Campaign:
         return {}
 
     def _say(self, line: str) -> None:
-        self._console.print(line, markup=False, soft_wrap=True)
+        self._console.print(plain(line), markup=False, soft_wrap=True)

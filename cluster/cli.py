@@ -18,6 +18,7 @@ from cluster.logs import configure
 from cluster.streams import Streams
 from shared.errors import AdaAffordError, UsageError
 from shared.extras import extra_of, missing_line, require
+from shared.plain import plain
 from shared.redaction import without_secrets
 
 logger = logging.getLogger(__name__)
@@ -153,7 +154,7 @@ def _interrupted(args: list[str]) -> int:
     """Say how to go on after Ctrl-C."""
     hint = "; what is committed stays, and the same command goes on" if args[0] in RESUMABLE else ""
     print(
-        f"adaafford: interrupted{hint}: adaafford {without_secrets(' '.join(args))}"
+        f"adaafford: interrupted{hint}: adaafford {plain(without_secrets(' '.join(args)))}"
         if hint
         else "adaafford: interrupted",
         file=sys.stderr,
@@ -163,7 +164,7 @@ def _interrupted(args: list[str]) -> int:
 
 def _complain(message: str, code: int) -> int:
     """Print one line."""
-    print(f"adaafford: {without_secrets(' '.join(message.split()))}", file=sys.stderr)
+    print(f"adaafford: {plain(without_secrets(' '.join(message.split())))}", file=sys.stderr)
     return code
 
 

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +11,13 @@ from cluster.blame import JobError
 from cluster.fleet import Fleet
 from cluster.in_force import PlanInForce
 from cluster.orders import Series
-from cluster.progress import CollectionProgress, Tally
+from cluster.progress import CollectionProgress, Tally, describe_empty
 from cluster.status import DriverStatus, State, StatusKeeper
 from shared.errors import WorkerError
 from shared.files import process_name
 from shared.plan import Plan, covered, missing_ranges
 from shared.reproduction import reproduction
-from shared.store import Store
+from shared.store import Store, reopen_quarantined
 from shared.store.info import quarantined_in
 
 OpenFleet = Callable[[], Fleet]
@@ -57,7 +58,14 @@ class Newest:
 
 
 def collect(
-    store: Store, plan: Plan | Newest, rollouts: int, per_shard: int, open_fleet: OpenFleet, objects: Path
+    store: Store,
+    plan: Plan | Newest,
+    rollouts: int,
+    per_shard: int,
+    open_fleet: OpenFleet,
+    objects: Path,
+    *,
+    retry_quarantined: bool = False,
 ) -> Collected:
     """Bring `plan` to `rollouts` committed rollouts.
 
@@ -69,21 +77,27 @@ def collect(
         per_shard: rollouts a shard.
         open_fleet: gives the fleet; not called if nothing is left to do.
         objects: folder of the objects, for the command that reproduces a failed job.
+        retry_quarantined: whether rollouts that were quarantined are executed again.
 
     Raises:
-        WorkerError: a job failed again and again; the message ends with the command that reproduces it.
+        WorkerError: a job failed again and again; the message ends with the command that reproduces it. Or all
+            rollouts that the store holds of the plan gave no interaction.
         StoreError: the plan's policy is not in the store.
     """
     # Only one driver works on a store, so whatever the dead left is of no use to anybody.
     store.sweep()
     if isinstance(plan, Plan):
         store.add_plan(plan)
+    if retry_quarantined:
+        reopened = reopen_quarantined(store, _plan_keys(store, plan))
+        logger.warning("%d quarantined rollouts of %s are executed again", reopened, plan.key)
     held = {key: [(job.start, job.stop) for job in store.jobs(key)] for key in _plan_keys(store, plan)}
     missing = missing_ranges(rollouts, [each for ranges in held.values() for each in ranges])
     already = rollouts - sum(stop - start for start, stop in missing)
     progress = CollectionProgress(f"collecting {plan.key}", already, rollouts, store.where)
     with progress:
         if not missing:
+            _require_interactions(store, plan)
             return Collected(progress.tally, 0.0, 0)
         fleet = open_fleet()
         version, per_version = (plan.policy_version, None) if isinstance(plan, Plan) else (None, plan.per_version)
@@ -99,6 +113,8 @@ def collect(
             raise WorkerError(f"{error}; reproduce it with: {command}") from None
     if progress.tally.quarantined:
         _report_quarantined(store, plan, objects)
+    if not progress.tally.interactions:
+        _require_interactions(store, plan)
     return Collected(progress.tally, progress.elapsed_s, fleet.workers)
 
 
@@ -154,6 +170,21 @@ class _Standing:
             workers=self.fleet.workers,
             restarts=self.fleet.restarts,
         )
+
+
+def _require_interactions(store: Store, plan: Plan | Newest) -> None:
+    """See that the store holds an interaction of the plan; manifests are read up to the first that has one."""
+    keys = _plan_keys(store, plan)
+    if any(store.manifest(job).interactions for key in keys for job in store.jobs(key)):
+        return
+    empty: dict[str, Counter[str]] = {}
+    for row in store.rollouts().select(["plan_key", "status", "object_id"]).to_pylist():
+        if row["plan_key"] in keys:
+            empty.setdefault(row["status"], Counter())[row["object_id"]] += 1
+    raise WorkerError(
+        f"{store.where}: holds no interaction of {plan.key}: {describe_empty(empty)}; `adaafford objects check "
+        "--settle` says which objects come to rest, and `--task TASK` which have a part to act on"
+    )
 
 
 def _report_quarantined(store: Store, plan: Plan | Newest, objects: Path) -> None:

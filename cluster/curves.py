@@ -16,6 +16,7 @@ from learner.comparison import CurveRow
 from learner.curve import ProposalGain
 from learner.training import without_nan
 from shared.files import make_folder, write_atomically
+from shared.plain import markdown
 
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, FIGURE_FILE = "curve.json", "curve.csv", "curve.md", "curve.png"
 CRITICS = {
@@ -75,7 +76,7 @@ def as_markdown(curves: Curves) -> str:
     pooled = [row for row in curves.rows if not row.run]
     base_rate = pooled[0].base_rate
     lines = [
-        f"# {curves.task}: what critics know after some tries",
+        f"# {markdown(curves.task)}: what critics know after some tries",
         "",
         f"{curves.rollouts} stored rollouts on {pooled[0].objects} objects that no training saw, each drawn "
         f"{curves.draws} times: half of its interactions may be tried, the other half is asked about; "
@@ -89,7 +90,7 @@ def as_markdown(curves: Curves) -> str:
     ]
     for row in pooled:
         cells = [
-            row.name,
+            markdown(row.name),
             CRITICS[row.critic],
             str(row.tries),
             percent(row.f_score, (row.f_score_low, row.f_score_high)),
@@ -105,7 +106,8 @@ def as_markdown(curves: Curves) -> str:
     for name, gains in curves.gains.items():
         lines += [
             "",
-            f"Drop of the loss on the questions by the next try, in thousandths of a nat ({name}, its first run):",
+            f"Drop of the loss on the questions by the next try, in thousandths of a nat ({markdown(name)}, its first "
+            "run):",
             "",
             "| tries | by a random one | by AIP's choice | by the best, in hindsight | loss before | correlation |",
             "| ---: | ---: | ---: | ---: | ---: | ---: |",
@@ -132,7 +134,7 @@ def _by_run(rows: Sequence[CurveRow]) -> list[str]:
         for critic, tries in asked:
             row = found.get((name, run, critic, tries))
             cells.append("-" if row is None else f"{percent(row.f_score)} / {percent(row.closed)}")
-        lines.append(f"| {name} | {run} | " + " | ".join(cells) + " |")
+        lines.append(f"| {markdown(name)} | {markdown(run)} | " + " | ".join(cells) + " |")
     return lines
 
 

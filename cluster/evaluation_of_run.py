@@ -19,6 +19,7 @@ from cluster.session import fleets
 from collector.guard import Limits
 from shared.errors import UsageError
 from shared.methods import METHODS, MethodName
+from shared.plain import plain
 from shared.plan import EvaluationConfig, ObjectRef, Setting
 from shared.policy import Policy
 from shared.store import Store
@@ -61,7 +62,8 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
         out=out,
     )
     _execute(evaluation, settings)
-    print((out / MARKDOWN_FILE).read_text(encoding="utf-8"), end="")
+    for line in (out / MARKDOWN_FILE).read_text(encoding="utf-8").splitlines():
+        print(plain(line))
     print(f"\n{out / RESULTS_FILE}")
 
 

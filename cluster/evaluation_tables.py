@@ -17,6 +17,7 @@ from cluster.cells import percent
 from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
 from shared.files import write_atomically
 from shared.methods import METHODS, MethodName
+from shared.plain import csv_cell, markdown
 
 RESULTS_FILE, CSV_FILE, MARKDOWN_FILE = "results.json", "table.csv", "table.md"
 
@@ -91,7 +92,7 @@ def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     text, names = io.StringIO(), [name for name in (rows[0] if rows else ()) if name not in _ONLY_FOR_PROGRAMS]
     writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({name: csv_cell(row[name]) for name in names} for row in rows)
     return text.getvalue()
 
 
@@ -100,7 +101,7 @@ def as_markdown(table: Table) -> str:
     base_rate = next((row["base_rate"] for row in table.rows), None)
     shown = "none" if base_rate is None else f"{100 * base_rate:.1f}%"
     lines = [
-        f"# {table.task}",
+        f"# {markdown(table.task)}",
         "",
         f"{table.rollouts} trials on {table.objects} test objects, seed {table.seed}, policy {table.policy_version}. "
         f"F-score at threshold 0.5 on random interactions, of which {shown} succeed. In brackets: 95% bootstrap "
@@ -121,4 +122,4 @@ def _cell(row: Mapping[str, Any], name: str) -> str:
         return percent(value, (row.get(f"{name}_low"), row.get(f"{name}_high")))
     if value is None:
         return "-"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:.3g}" if isinstance(value, float) else markdown(value)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from cluster.blame import Blame, Failure, describe
+from cluster.blame import Backlog, Blame, Failure
 from cluster.orders import Order, Orders
 from collector.guard import UnderWay
 from shared.errors import AdaAffordError
@@ -108,31 +108,36 @@ class SerialFleet:
     def run(self, orders: Orders, on_receipt: Callable[["Receipt"], None]) -> None:
         """See `Fleet.run`."""
         blame = Blame()
-        while not orders.ended:
-            order = orders.take()
+        backlog = Backlog(orders, blame)
+        while not backlog.ended:
+            order = backlog.take(idle=True)
             if order is None:
                 time.sleep(WAIT_S)
+            elif (receipt := self._run(order, blame)) is None:
+                backlog.put_back([order])
             else:
-                on_receipt(self._run_stubbornly(order, blame))
+                on_receipt(receipt)
 
     def close(self) -> None:
         """See `Fleet.close`."""
         self._worker = None
 
-    def _run_stubbornly(self, order: Order, blame: Blame) -> "Receipt":
-        """Try a job, with a fresh worker after each failure, until it is done or no rollout is to blame."""
-        plan, job = order.plan, order.job
-        while True:
-            rollouts: list[int | None] = [None]
-            try:
-                return self._live_worker().run(plan, job, blame.quarantined(job), rollouts.append)
-            except AdaAffordError:
-                raise
-            except Exception as error:
-                logger.info("job %s failed", job.shard_id, exc_info=True)
-                self._worker = None
-                self.restarts += 1
-                blame.charge(job, Failure(describe(error), rollouts[-1], fault=True))
+    def _run(self, order: Order, blame: Blame) -> "Receipt | None":
+        """Try a job; None if it failed, which takes a fresh worker the next time."""
+        job = order.job
+        rollouts: list[int | None] = [None]
+        try:
+            receipt = self._live_worker().run(order.plan, job, blame.quarantined(job), rollouts.append)
+        except AdaAffordError:
+            raise
+        except Exception as error:
+            logger.info("job %s failed", job.shard_id, exc_info=True)
+            self._worker = None
+            self.restarts += 1
+            blame.charge(job, Failure.of_exception(error, rollouts[-1]))
+            return None
+        blame.acquit(job)
+        return receipt
 
     def _live_worker(self) -> Worker:
         """The worker, made and given all policies if there is none yet."""

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+from shared.plain import plain
 from shared.redaction import without_secrets
 
 VARIABLE = "ADAAFFORD_LOG"
@@ -17,6 +18,18 @@ OURS = ("cluster", "collector", "learner", "shared")
 """Packages of which machines are told more than warnings."""
 FIELDS = ("plan", "policy", "shard", "rollout", "worker", "interactions", "successes", "seconds", "reason")
 """What a line may be about."""
+
+
+class Lines(logging.Formatter):
+    """A record as one line for people."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
+        """See `logging.Formatter.formatMessage`."""
+        return plain(super().formatMessage(record))
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See `logging.Formatter.format`."""
+        return without_secrets(super().format(record))
 
 
 class JsonLines(logging.Formatter):
@@ -36,14 +49,6 @@ class JsonLines(logging.Formatter):
         return without_secrets(json.dumps(line, default=str))
 
 
-class Lines(logging.Formatter):
-    """A record as a line for people."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """See `logging.Formatter.format`."""
-        return without_secrets(super().format(record))
-
-
 def configure(environment: Mapping[str, str]) -> None:
     """Set up logging of this process, to standard error.
 
@@ -54,7 +59,5 @@ def configure(environment: Mapping[str, str]) -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(JsonLines() if as_json else Lines("adaafford: %(message)s"))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
-    if not as_json:
-        return
-    for name in OURS:
+    for name in OURS if as_json else ():
         logging.getLogger(name).setLevel(logging.INFO)

@@ -13,6 +13,7 @@ from learner.stages import DONE_FILE, objects_seen, read_policy_folder
 from shared.configuration import CameraConfig
 from shared.errors import UsageError
 from shared.files import read_bounded
+from shared.plain import markdown
 from shared.plan import ObjectRef
 from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.store import Store
@@ -155,7 +156,7 @@ def _data(source: Source) -> str:
 
 {len(rows):,} interactions ({rate}) in simulation, seed {setting.seed}, fidelity `{setting.collection.fidelity.name}`,
 clouds of {setting.collection.camera.points} points; {source.origin}: {source.objects}
-({", ".join(f"{count} {name}" for name, count in sorted(categories.items()))}). Digest of the interactions:
+({", ".join(f"{count} {markdown(name)}" for name, count in sorted(categories.items()))}). Digest of the interactions:
 `{source.store.digest()[:16]}`."""
 
 

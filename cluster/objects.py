@@ -1,5 +1,6 @@
 """Which objects a run uses: a folder that the user names, or built-in procedural ones; and which it is tested on."""
 
+import logging
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -13,6 +14,11 @@ from shared.categories import expanded
 from shared.errors import UsageError
 from shared.plan import ObjectRef
 from shared.tasks import Task
+
+MOST_NOTED = 10
+"""Objects of which a command says what was left out of their files."""
+
+logger = logging.getLogger(__name__)
 
 
 def objects_for(
@@ -44,6 +50,7 @@ def objects_for(
     if not catalogue.usable:
         why = f"; the first: {catalogue.refused[0][0]}: {catalogue.refused[0][1]}" if catalogue.refused else ""
         raise UsageError(f"{folder}: none of {len(catalogue.refused)} objects suits the task '{task.name}'{why}")
+    _say_notes(catalogue)
     return catalogue, folder
 
 
@@ -60,6 +67,16 @@ def require_same_objects(wanted: Iterable[ObjectRef], folder: Path) -> None:
             f"{folder}: {len(missing)} of the objects wanted are not there or have other content, such as "
             f"{short(missing[0])}; name the folder that holds the same files"
         )
+
+
+def _say_notes(catalogue: Catalogue) -> None:
+    """Say which objects are not used as their files have them."""
+    noted = [entry for entry in catalogue.usable if entry.notes]
+    for entry in noted[:MOST_NOTED]:
+        logger.warning("object %s: %s", entry.ref.id, "; ".join(entry.notes))
+    if len(noted) > MOST_NOTED:
+        more = len(noted) - MOST_NOTED
+        logger.warning("%d more objects have something left out; `adaafford objects check` says what", more)
 
 
 def built_in_categories(task: Task, categories: tuple[str, ...]) -> list[str]:

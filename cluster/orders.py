@@ -36,6 +36,11 @@ class Orders(Protocol):
         """Whether there will be no more."""
         ...
 
+    @property
+    def any_done(self) -> bool:
+        """Whether some of what they are part of was done before."""
+        ...
+
     def take(self) -> Order | None:
         """The next one; None where there is none, or none yet: `ended` tells which."""
         ...
@@ -46,6 +51,7 @@ class Listed:
 
     def __init__(self, plan: Plan, jobs: Sequence[Job]) -> None:
         self._left = [Order(plan, job) for job in reversed(jobs)]
+        self.any_done = False
 
     @property
     def ended(self) -> bool:
@@ -81,6 +87,7 @@ class Series:
         self._per_shard = per_shard
         self._per_plan = per_plan
         self._handed_out = Counter(held)
+        self.any_done = any(held.values())
         self.waiting = False
         """Whether the last one that asked had to wait for another plan."""
 

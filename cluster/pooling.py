@@ -27,6 +27,7 @@ from learner.training import without_nan
 from shared.configuration import parse
 from shared.errors import UsageError
 from shared.files import make_folder, write_atomically
+from shared.plain import markdown
 from shared.store import Store
 
 MARKDOWN_FILE, CSV_FILE, JSON_FILE, FIGURE_FILE = (f"comparison.{kind}" for kind in ("md", "csv", "json", "png"))
@@ -275,7 +276,7 @@ def as_markdown(comparison: Comparison) -> str:
     runs = "run (seed" if len(comparison.seeds) == 1 else "runs (seeds"
     novel = ", of categories that none saw" if comparison.novel_categories else ""
     lines = [
-        f"# {comparison.task}: all methods",
+        f"# {markdown(comparison.task)}: all methods",
         "",
         f"{comparison.rollouts} trials on {comparison.objects} objects that no training saw{novel}, "
         f"{len(comparison.seeds)} {runs} {_seeds(comparison)}). In percent; in brackets "
@@ -291,7 +292,7 @@ def as_markdown(comparison: Comparison) -> str:
     ]
     for row in comparison.rows:
         cells = [
-            row.method,
+            markdown(row.method),
             str(row.budget),
             _with_limits(row.shares["f_score"]),
             _of_paper(row.paper["f_score"]),
@@ -315,7 +316,7 @@ def as_markdown(comparison: Comparison) -> str:
     for row in comparison.rows:
         each = zip(*(row.by_run[name] for name in MEASURES), strict=True)
         shown = [" / ".join(map(percent, values)) for values in each]
-        lines.append(f"| {row.method} | {row.budget} | " + " | ".join(shown) + " |")
+        lines.append(f"| {markdown(row.method)} | {row.budget} | " + " | ".join(shown) + " |")
     return "\n".join(lines) + "\n"
 
 

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, TextColumn
 from rich.text import Text
+
+from shared.plain import plain
 
 if TYPE_CHECKING:
     from rich.progress import Task
@@ -20,6 +22,14 @@ if TYPE_CHECKING:
 LINE_EVERY_S = 5.0
 RECENT_S = 30.0
 """What a rate counts as recent."""
+MOST_OBJECTS = 5
+"""Objects that the last line names for each reason why rollouts gave nothing."""
+EMPTY = {
+    "never-at-rest": "never at rest",
+    "nothing-to-act-on": "with no part in sight that the task may act on",
+    "ok": "cut short before the first",
+}
+"""What a status of rollouts without interactions means."""
 MAX_RECENT = 1024
 """Receipts that are remembered for it."""
 
@@ -36,6 +46,8 @@ class Tally:
     """Of all workers together, by stage."""
     quarantined: int = 0
     """Rollouts that were given up."""
+    empty: dict[str, dict[str, int]] = field(default_factory=dict)
+    """Rollouts without interactions, by status and by object."""
     memory_mb: float = 0.0
     """Of the largest worker."""
 
@@ -49,6 +61,10 @@ class Tally:
         for name, seconds in receipt.seconds.items():
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
         self.quarantined += receipt.quarantined
+        for status, objects in receipt.empty.items():
+            of_status = self.empty.setdefault(status, {})
+            for name, count in objects.items():
+                of_status[name] = of_status.get(name, 0) + count
         self.memory_mb = max(self.memory_mb, receipt.memory_mb)
 
     @property
@@ -95,7 +111,8 @@ class CollectionProgress:
         if self._bar is not None:
             self._bar.stop()
         if self.tally.rollouts:
-            self.say(f"{self._title}: {self.describe()}")
+            empty = describe_empty(self.tally.empty)
+            self.say("; ".join([f"{self._title}: {self.describe()}", *([empty] if empty else [])]))
 
     def __call__(self, receipt: "Receipt") -> None:
         """Take in one receipt."""
@@ -135,7 +152,7 @@ class CollectionProgress:
 
     def say(self, line: str) -> None:
         """Print a line."""
-        self._console.print(line, soft_wrap=True, markup=False)
+        self._console.print(plain(line), soft_wrap=True, markup=False)
 
 
 class _Rates(ProgressColumn):
@@ -148,6 +165,24 @@ class _Rates(ProgressColumn):
     def render(self, task: "Task") -> Text:
         """See `rich.progress.ProgressColumn`."""
         return Text(self._progress.describe())
+
+
+def describe_empty(empty: Mapping[str, Mapping[str, int]]) -> str:
+    """How many rollouts gave no interaction, why, and of which objects; "" if there are none.
+
+    Args:
+        empty: how many, by status and by object.
+    """
+    if not empty:
+        return ""
+    count = sum(sum(objects.values()) for objects in empty.values())
+    reasons = []
+    for status, objects in sorted(empty.items()):
+        most = sorted(objects.items(), key=lambda item: (-item[1], item[0]))
+        named = ", ".join(f"{name} {number}" for name, number in most[:MOST_OBJECTS])
+        more = f", {len(most) - MOST_OBJECTS} objects more" if len(most) > MOST_OBJECTS else ""
+        reasons.append(f"{sum(objects.values())} {EMPTY.get(status, status)} ({named}{more})")
+    return f"{count} rollouts gave no interaction: {'; '.join(reasons)}"
 
 
 def _minutes(seconds: float) -> str:

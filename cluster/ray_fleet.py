@@ -7,9 +7,9 @@ of being looked for among all that are expected, and seats are filed by what the
 import logging
 import socket
 import time
-from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from concurrent.futures import Future
+from dataclasses import replace
 from functools import partial
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Protocol
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from cluster.blame import Blame, Failure, describe
+from cluster.blame import Backlog, Blame, Failure, of_environment
 from cluster.fleet import WAIT_S, WorkerFactory
 from cluster.metrics import Cause, FleetMetrics
 from cluster.orders import Order, Orders
@@ -147,17 +147,17 @@ class RayFleet:
 
     def run(self, orders: Orders, on_receipt: Callable[["Receipt"], None]) -> None:
         """See `Fleet.run`."""
-        waiting: deque[Order] = deque()
         blame = Blame(self.workers)
+        backlog = Backlog(orders, blame)
         try:
-            while waiting or not orders.ended or self._in_flight:
-                self._hand_out(orders, waiting, blame)
+            while not backlog.ended or self._in_flight:
+                self._hand_out(backlog, blame)
                 for seat in self._wait():
                     # An actor's answers are taken in the order of what was asked, in whichever they are announced; of
                     # one that was dismissed some are announced that nobody waits for.
                     while seat.tasks and seat.tasks[0].answer.done():
-                        self._take_in(seat, waiting, blame, on_receipt)
-                self._replace_hung(waiting, blame)
+                        self._take_in(seat, backlog, blame, on_receipt)
+                self._replace_hung(backlog, blame)
         finally:
             # Only after a failure or an interrupt is anything left; what an actor would still commit is wanted by the
             # next run anyway, but nobody would wait for it, so the actor goes.
@@ -179,27 +179,26 @@ class RayFleet:
             except Empty:
                 return
 
-    def _hand_out(self, orders: Orders, waiting: deque[Order], blame: Blame) -> None:
+    def _hand_out(self, backlog: Backlog, blame: Blame) -> None:
         """Give actors that are up what they want, and call an actor for each order that has to wait.
 
         An actor that is called may be long in coming, or for ever where a machine has left; so nothing is bound to it.
 
         Args:
-            orders: where new ones come from.
-            waiting: those that failed, which go first, and those that actors were called for.
+            backlog: where they come from, and those that actors were called for go.
             blame: knows what is not to be executed any more.
         """
         while (seat := self._seats.hungriest) is not None:
-            order = waiting.popleft() if waiting else orders.take()
+            order = backlog.take(idle=not self._in_flight)
             if order is None:
                 return
             self._give(seat, order, blame)
         while (seat := self._seats.empty) is not None:
-            if len(waiting) <= self._seats.called:
-                order = orders.take()
+            if len(backlog) <= self._seats.called:
+                order = backlog.take_new(idle=not self._in_flight and not backlog)
                 if order is None:
                     return
-                waiting.append(order)
+                backlog.append(order)
             seat.actor, seat.busy_since = self._call(), time.monotonic()
             self._ask(seat, None, seat.actor.arrive())
 
@@ -219,9 +218,7 @@ class RayFleet:
         self._seats.file(seat)
         answer.add_done_callback(lambda _: self._answered.put(seat))
 
-    def _take_in(
-        self, seat: Seat, waiting: deque[Order], blame: Blame, on_receipt: Callable[["Receipt"], None]
-    ) -> None:
+    def _take_in(self, seat: Seat, backlog: Backlog, blame: Blame, on_receipt: Callable[["Receipt"], None]) -> None:
         """Report the receipt that has come for the seat's oldest task, or see to the failure."""
         task = seat.tasks[0]
         try:
@@ -229,11 +226,12 @@ class RayFleet:
         except RayTaskError as error:
             if isinstance(error.cause, AdaAffordError):
                 raise error.cause from None
-            self._fail(seat, waiting, blame, describe(error.cause or error), fault=True)
+            cause = error.cause or error
+            self._fail(seat, backlog, blame, Failure.of_exception(cause, None), in_rollout=not of_environment(cause))
             return
         except RayError:
             words = self._underway.fault_of(seat.process) if seat.process else ""
-            self._fail(seat, waiting, blame, words or LOST, fault=bool(words))
+            self._fail(seat, backlog, blame, Failure(words or LOST, None, fault=bool(words)))
             return
         seat.settle()
         if task.order is None:
@@ -241,7 +239,7 @@ class RayFleet:
             logger.info("a worker is up", extra={"worker": seat.process})
         else:
             self._in_flight -= 1
-            blame.acquit()
+            blame.acquit(task.order.job)
             self._note_done(seat, task.order.plan, message)
             self._retire_if_grown(seat, message)
         if seat.retiring and not seat.tasks:
@@ -251,7 +249,7 @@ class RayFleet:
         if task.order is not None:
             on_receipt(message)
 
-    def _replace_hung(self, waiting: deque[Order], blame: Blame) -> None:
+    def _replace_hung(self, backlog: Backlog, blame: Blame) -> None:
         """Replace actors that hang so thoroughly that not even their own watchdog ended them.
 
         A rollout is over its limit when the driver has seen its breadcrumb unchanged for so long by its own clock:
@@ -270,18 +268,19 @@ class RayFleet:
             busy_s = now - seat.busy_since if seat.tasks else 0.0
             if seat.process:
                 if busy_s > self._limits.rollout_s:
-                    self._look(seat, waiting, blame)
+                    self._look(seat, backlog, blame)
             elif busy_s > START_LIMIT_S:
                 self._call_again(seat, blame)
 
-    def _look(self, seat: Seat, waiting: deque[Order], blame: Blame) -> None:
+    def _look(self, seat: Seat, backlog: Backlog, blame: Blame) -> None:
         """Replace a seat's actor if it hangs."""
         crumb, since = seat.look(self._underway)
         limit = START_LIMIT_S if crumb is None else self._limits.rollout_s + GRACE_S
         if time.monotonic() - since > limit:
             # A process that is stopped does not hear Ray.
             end_if_here(seat.process)
-            self._fail(seat, waiting, blame, f"took more than {limit:g} s, and had to be killed", fault=True)
+            reason = f"took more than {limit:g} s, and had to be killed"
+            self._fail(seat, backlog, blame, Failure(reason, None, fault=True))
 
     def _call_again(self, seat: Seat, blame: Blame) -> None:
         """Give up an actor that has not come; that others work means that a machine is missing, which may come back."""
@@ -307,22 +306,30 @@ class RayFleet:
             logger.warning("a worker has grown by %.0f MB and is replaced", grown_mb, extra=about)
             seat.retiring = True
 
-    def _fail(self, seat: Seat, waiting: deque[Order], blame: Blame, reason: str, *, fault: bool) -> None:
-        """Replace the seat's actor and put its jobs back in front; only what was under way is to blame."""
+    def _fail(self, seat: Seat, backlog: Backlog, blame: Blame, failure: Failure, *, in_rollout: bool = True) -> None:
+        """Replace the seat's actor and put its jobs back in front; only what was under way is to blame.
+
+        Args:
+            seat: whose actor failed.
+            backlog: takes the jobs back.
+            blame: decides what comes of them.
+            failure: how; which rollout was under way is found here.
+            in_rollout: whether that may be to blame.
+        """
         orders = seat.orders
         crumb = self._underway.crumb_of(seat.process) if seat.process else None
-        about = {"worker": seat.process, "rollout": crumb.rollout if crumb else None, "reason": reason}
-        logger.info("a worker is replaced: %s", reason, extra=about)
+        about = {"worker": seat.process, "rollout": crumb.rollout if crumb else None, "reason": failure.reason}
+        logger.info("a worker is replaced: %s", failure.reason, extra=about)
         self._dismiss(seat)
-        self._count_replaced("fault" if fault else "loss")
+        self._count_replaced("fault" if failure.fault else "loss")
         if not orders:
-            blame.charge_nobody(reason)
+            blame.charge_nobody(failure.reason)
             return
-        waiting.extendleft(reversed(orders))
         jobs = [order.job for order in orders]
         job = next((job for job in jobs if crumb is not None and crumb.shard_id == job.shard_id), jobs[0])
-        known = crumb is not None and crumb.shard_id == job.shard_id
-        blame.charge(job, Failure(reason, crumb.rollout if known and crumb is not None else None, fault))
+        known = crumb is not None and crumb.shard_id == job.shard_id and in_rollout
+        blame.charge(job, replace(failure, rollout=crumb.rollout if known and crumb is not None else None))
+        backlog.put_back(orders)
 
     def _count_replaced(self, cause: Cause) -> None:
         self.restarts += 1

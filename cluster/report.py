@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from cluster.cells import number
 from cluster.configuration import CampaignConfig
@@ -17,6 +18,7 @@ from cluster.ledger import Ledger
 from cluster.run_folder import RunFolder, read_json
 from shared.errors import UsageError
 from shared.files import write_atomically
+from shared.plain import plain
 from shared.policy import Policy
 from shared.store import Store
 from shared.store.provenance import software_versions
@@ -72,7 +74,7 @@ def print_report(run: RunFolder) -> None:
     console.print(_results_table(summary))
     console.print(_rates_table(summary))
     for line in _lines(summary, run):
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(plain(line), markup=False, soft_wrap=True)
 
 
 def _rows(run: RunFolder) -> list[dict[str, Any]]:
@@ -111,7 +113,7 @@ def _write_page(run: RunFolder, config: CampaignConfig, experiments: bool, say: 
 
 
 def _results_table(summary: dict[str, Any]) -> Table:
-    table = Table(title=f"{summary['task']}: objects not seen in training")
+    table = Table(title=Text(f"{plain(summary['task'])}: objects not seen in training"))
     figures = ("f_score", "sample_success", "start_success", "trials", "best_f", "bce", "auc", "base_rate")
     names = ("method", "budget", *figures)
     for name in names:
@@ -126,7 +128,7 @@ def _rates_table(summary: dict[str, Any]) -> Table:
     for name in ("category", "interactions", "successes", "success rate"):
         table.add_column(name, justify="left" if name == "category" else "right")
     for category, rate in summary["random_success_by_category"].items():
-        table.add_row(category, *(_cell(rate[name]) for name in ("interactions", "successes", "success_rate")))
+        table.add_row(_cell(category), *(_cell(rate[name]) for name in ("interactions", "successes", "success_rate")))
     return table
 
 
@@ -154,5 +156,5 @@ def _shown(path: Path) -> str:
     return str(path) if path.exists() else f"(no {path.name})"
 
 
-def _cell(value: Any) -> str:
-    return value if isinstance(value, str) else number(value)
+def _cell(value: Any) -> Text:
+    return Text(plain(value) if isinstance(value, str) else number(value))

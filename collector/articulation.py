@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from shared.plan import ObjectRef
 from shared.vocabulary import Float
 
+MIN_RANGE = 1e-6
+"""A joint whose limits are closer than this cannot move."""
+
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
@@ -41,6 +44,11 @@ class Joint:
     upper: float
     """Likewise, cut to pi."""
 
+    @property
+    def span(self) -> float:
+        """Upper limit minus lower limit."""
+        return self.upper - self.lower
+
 
 @dataclass(frozen=True, slots=True)
 class Body:
@@ -64,6 +72,8 @@ class ArticulatedObject:
 
     ref: ObjectRef
     bodies: tuple[Body, ...]
+    notes: tuple[str, ...] = ()
+    """What of its files was left out or read otherwise, for the user to know: one phrase each."""
 
     @property
     def parts(self) -> tuple[Body, ...]:

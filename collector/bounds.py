@@ -48,7 +48,7 @@ def check_bounds(bodies: Sequence[Body]) -> None:
         if not reach <= MAX_REACH:
             raise ObjectError(
                 f"link {short(body.link)} can be {reach:.3g} from the root's origin; at most {MAX_REACH:g} is allowed "
-                "(published objects fit into a sphere of radius 1)"
+                "(published objects fit into a sphere of radius 1; scale meshes in millimetres by 0.001)"
             )
 
 

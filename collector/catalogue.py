@@ -11,18 +11,16 @@ from typing import Literal
 
 import numpy as np
 
-from collector.articulation import ArticulatedObject
+from collector.articulation import MIN_RANGE, ArticulatedObject
 from collector.decomposition import Decomposer, cache_folder
 from collector.files import short
-from collector.partnet import URDF_FILE, read_object
+from collector.partnet import URDF_FILE, read_object, urdf_of
 from shared.configuration import Collision
 from shared.errors import ObjectError, UsageError
 from shared.plan import ObjectRef
 from shared.seeds import generator
 from shared.tasks import Task
 
-MIN_RANGE = 1e-6
-"""A joint whose limits are closer than this cannot move."""
 MAX_LIST_BYTES = 1 << 20
 _OBJECT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -47,6 +45,15 @@ class CatalogueEntry:
     ref: ObjectRef
     folder: Path
     parts: tuple[PartSummary, ...]
+    tree: Path
+    """The folder that was scanned, below which links are followed."""
+    notes: tuple[str, ...] = ()
+    """What was left out or read otherwise, one phrase each."""
+
+    @property
+    def movable(self) -> int:
+        """How many parts can move."""
+        return sum(part.span > MIN_RANGE for part in self.parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +88,12 @@ def scan(path: Path, *object_lists: Path) -> Catalogue:
     if object_lists:
         listed = dict.fromkeys(object_id for each in object_lists for object_id in read_list(each))
         folders = {object_id: folders.get(object_id, path / object_id) for object_id in listed}
-    elif not any((folder / URDF_FILE).is_file() for folder in folders.values()):
+    elif all(urdf_of(folder) is None for folder in folders.values()):
         raise UsageError(f"{path}: holds no object; name a folder of <id>/{URDF_FILE}, or one <id> itself")
     usable, refused = [], []
     for object_id in sorted(folders):
         try:
-            usable.append(_entry(folders[object_id]))
+            usable.append(_entry(folders[object_id], path))
         except ObjectError as error:
             refused.append((object_id, str(error)))
     return Catalogue(tuple(usable), tuple(refused))
@@ -102,7 +109,7 @@ def read_list(path: Path) -> tuple[str, ...]:
         # What is missing fails here, with its reason; a pipe is never opened, since reading it could block for ever.
         if path.stat().st_size > MAX_LIST_BYTES or not path.is_file():
             raise UsageError(f"{path}: not a file of at most {MAX_LIST_BYTES} bytes; name '<id> <category>' lines")
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:
         raise UsageError(f"{path}: cannot be read ({error.strerror}); name a list of '<id> <category>' lines") from None
     except UnicodeDecodeError:
@@ -120,7 +127,7 @@ def load(entry: CatalogueEntry) -> ArticulatedObject:
     Raises:
         ObjectError: its files cannot be read, or are not those that were catalogued.
     """
-    return _load(entry.folder, entry.ref)
+    return _load(entry.folder, entry.tree, entry.ref)
 
 
 def load_ref(path: Path, ref: ObjectRef, collision: Collision = "hulls") -> ArticulatedObject:
@@ -134,7 +141,7 @@ def load_ref(path: Path, ref: ObjectRef, collision: Collision = "hulls") -> Arti
     Raises:
         ObjectError: there is none, its files are not those that `ref` was made from, or it cannot be decomposed.
     """
-    loaded = _load(path if (path / URDF_FILE).is_file() else path / ref.id, ref)
+    loaded = _load(path / ref.id if urdf_of(path) is None else path.resolve(), path, ref)
     if collision == "hulls":
         return loaded
     with Decomposer(cache_folder()) as decomposer:
@@ -198,7 +205,7 @@ def split(refs: Iterable[ObjectRef], fractions: tuple[float, float, float], seed
 def summaries(described: ArticulatedObject) -> tuple[PartSummary, ...]:
     """What tasks ask of each part of an object."""
     return tuple(
-        PartSummary(body.part_name, body.joint.kind, body.joint.upper - body.joint.lower, bool(body.visuals))
+        PartSummary(body.part_name, body.joint.kind, body.joint.span, bool(body.visuals))
         for body in described.parts
         if body.joint is not None
     )
@@ -208,21 +215,21 @@ def _object_folders(path: Path) -> dict[str, Path]:
     """Object folders by id."""
     if not path.is_dir():
         raise UsageError(f"{path}: no such folder; name a folder of objects, or one object's folder")
-    if (path / URDF_FILE).exists():
-        return {path.resolve().name: path}
+    if urdf_of(path) is not None:
+        return {path.resolve().name: path.resolve()}
     try:
         return {child.name: child for child in path.iterdir() if child.is_dir() and not child.name.startswith(".")}
     except OSError as error:
         raise UsageError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _entry(folder: Path) -> CatalogueEntry:
-    described = read_object(folder)
-    return CatalogueEntry(described.ref, folder, summaries(described))
+def _entry(folder: Path, tree: Path) -> CatalogueEntry:
+    described = read_object(folder, tree)
+    return CatalogueEntry(described.ref, folder, summaries(described), tree, described.notes)
 
 
-def _load(folder: Path, ref: ObjectRef) -> ArticulatedObject:
-    loaded = read_object(folder)
+def _load(folder: Path, tree: Path, ref: ObjectRef) -> ArticulatedObject:
+    loaded = read_object(folder, tree)
     if loaded.ref != ref:
         raise ObjectError(
             f"{folder}: is not the object that was planned ({loaded.ref.id} {loaded.ref.content_hash[:12]} instead of "

@@ -1,22 +1,24 @@
-"""Reader of one object in PartNet-Mobility's layout.
+"""Reader of one object in PartNet-Mobility's layout; docs/objects.md describes it for users.
 
     <id>/mobility.urdf, meta.json, semantics.txt, textured_objs/*.obj
 
-The folder's name is the object's id. Everything in it is hostile until checked.
+The folder's name is the object's id. Everything in it is hostile until checked. A mesh that is absent or unusable is
+left out, as the simulator's own reader does, and noted; a part that keeps no shape at all makes the object unusable.
 """
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
+from urllib.parse import unquote
 
 import numpy as np
 from pydantic import ValidationError
 
 from collector import meshes
-from collector.articulation import ArticulatedObject, Body, Joint, Mesh
+from collector.articulation import MIN_RANGE, ArticulatedObject, Body, Joint, Mesh
 from collector.bounds import check_bounds
 from collector.files import ObjectFiles, short
 from collector.urdf import MAX_URDF_BYTES, Shape, Urdf, UrdfJoint, parse_urdf
@@ -28,54 +30,94 @@ MAX_TEXT_BYTES = 1 << 20
 MAX_OBJECT_BYTES = 256 << 20
 MAX_OBJECT_VERTICES = 5_000_000
 """Over all shapes: a URDF may show one mesh many times."""
+MAX_OBJECT_TRIANGLES = 10_000_000
+"""Over all mesh files."""
 MAX_WORD = 64
+MOST_NAMED = 3
+"""Meshes and joints that a note names."""
 
-URDF_FILE = "mobility.urdf"
+URDF_FILES = ("mobility.urdf", "mobility_vhacd.urdf", "mobility_cvx.urdf")
+"""The first that is there is read; the others are what Where2Act and ManiSkill derive from it."""
+URDF_FILE = URDF_FILES[0]
 META_FILE = "meta.json"
 SEMANTICS_FILE = "semantics.txt"
 
 
-def read_object(folder: Path) -> ArticulatedObject:
+def urdf_of(folder: Path) -> str | None:
+    """The name of the URDF in a folder; None where it holds no object."""
+    return next((name for name in URDF_FILES if (folder / name).is_symlink() or (folder / name).exists()), None)
+
+
+def read_object(folder: Path, tree: Path | None = None) -> ArticulatedObject:
     """Read, check and merge one object.
 
     Links that fixed joints tie together become one body. A body without collision meshes collides as it looks.
 
+    Args:
+        folder: of the object.
+        tree: the folder of objects that the user named, below which links are followed; `folder` where none is given.
+
     Raises:
         ObjectError: with one line that says what is wrong with the object's files.
     """
-    files = ObjectFiles(folder)
-    urdf_bytes = files.read(URDF_FILE, MAX_URDF_BYTES)
+    files = ObjectFiles(folder, tree)
+    urdf_file = urdf_of(folder) or URDF_FILE
+    urdf_bytes = files.read(urdf_file, MAX_URDF_BYTES)
     category = _category(files)
     semantics = files.read(SEMANTICS_FILE, MAX_TEXT_BYTES) if files.exists(SEMANTICS_FILE) else b""
-    urdf = parse_urdf(urdf_bytes, str(folder / URDF_FILE))
+    urdf = parse_urdf(urdf_bytes, str(folder / urdf_file))
     if all(joint.kind == "fixed" for joint in urdf.joints):
         raise ObjectError(f"{folder}: has no movable part: every joint is fixed")
-    mesh_bytes = _read_meshes(files, urdf)
-    content = {URDF_FILE: urdf_bytes, SEMANTICS_FILE: semantics, "category": category.encode(), **mesh_bytes}
-    ref = _reference(folder, category, content_hash(content))
-    bodies = _Bodies(urdf, mesh_bytes, _part_names(semantics, folder), folder).merged()
+    documents = {urdf_file: urdf_bytes, SEMANTICS_FILE: semantics, "category": category.encode()}
+    found, digest = _Meshes(files, folder), hashlib.sha256()
+    for name in sorted({*documents, *urdf.mesh_files()}):
+        data = documents[name] if name in documents else found.load(name)
+        for part in () if data is None else (name.encode("utf-8", "surrogatepass"), data):
+            # Lengths keep the boundary between two files from being moved without notice.
+            digest.update(len(part).to_bytes(8, "big"))
+            digest.update(part)
+    ref = _reference(folder, category, digest.hexdigest())
+    bodies = _Bodies(urdf, found, _part_names(semantics, folder), folder).merged()
     try:
         check_bounds(bodies)
     except ObjectError as error:
         raise ObjectError(f"{folder}: {error}") from None
-    if not any(body.visuals and body.joint for body in bodies):
+    _require_a_movable_part(bodies, folder)
+    notes = [] if urdf_file == URDF_FILE else [f"read from {urdf_file}"]
+    return ArticulatedObject(ref, bodies, (*notes, *found.notes(), *_joint_notes(urdf, bodies)))
+
+
+def _require_a_movable_part(bodies: Sequence[Body], folder: Path) -> None:
+    moving = [body for body in bodies if body.joint is not None and body.joint.span > MIN_RANGE]
+    if not moving:
+        joint = next(body.joint for body in bodies if body.joint is not None)
+        raise ObjectError(
+            f"{folder}: has no movable part: no joint can move, since the lower and the upper limit of each are the "
+            f"same (such as {joint.lower:g} and {joint.upper:g} of {short(joint.name)})"
+        )
+    if not any(body.visuals for body in moving):
         raise ObjectError(f"{folder}: has no movable part that can be seen: its moving links have no mesh")
-    return ArticulatedObject(ref, bodies)
 
 
-def content_hash(content: Mapping[str, bytes]) -> str:
-    """SHA-256 over names and bytes, whatever their order."""
-    digest = hashlib.sha256()
-    for name in sorted(content):
-        for part in (name.encode("utf-8", "surrogatepass"), content[name]):
-            # Lengths keep the boundary between two files from being moved without notice.
-            digest.update(len(part).to_bytes(8, "big"))
-            digest.update(part)
-    return digest.hexdigest()
+def _joint_notes(urdf: Urdf, bodies: Sequence[Body]) -> Iterator[str]:
+    """What of its joints a user would not expect."""
+    still = [body.joint for body in bodies if body.joint is not None and body.joint.span <= MIN_RANGE]
+    if still:
+        names = _listed([short(joint.name) for joint in still])
+        yield f"{len(still)} of {len(bodies) - 1} joints cannot move, since both limits are the same ({names})"
+    mimics = [f"{short(joint.name)} of {short(joint.mimics)}" for joint in urdf.joints if joint.mimics]
+    if mimics:
+        yield f"<mimic> is not followed: what has it moves on its own ({_listed(mimics)})"
+
+
+def _listed(words: Sequence[str]) -> str:
+    more = f" and {len(words) - MOST_NAMED} more" if len(words) > MOST_NAMED else ""
+    return ", ".join(words[:MOST_NAMED]) + more
 
 
 def _reference(folder: Path, category: str, digest: str) -> ObjectRef:
-    object_id = folder.resolve().name
+    # Of a link the name is its own, by which the object is found again below the folder of objects.
+    object_id = folder.absolute().name
     try:
         return ObjectRef(id=object_id, category=category, content_hash=digest)
     except ValidationError:
@@ -86,21 +128,26 @@ def _reference(folder: Path, category: str, digest: str) -> ObjectRef:
 
 def _category(files: ObjectFiles) -> str:
     """`model_cat` of meta.json."""
+    if not files.exists(META_FILE):
+        raise ObjectError(
+            f"{files.folder}: '{META_FILE}' is missing; write one that names the category, such as "
+            '{"model_cat": "StorageFurniture"} (docs/objects.md)'
+        )
     data = files.read(META_FILE, MAX_TEXT_BYTES)
     try:
-        meta = json.loads(data)
+        meta = json.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise ObjectError(f"{files.folder / META_FILE}: malformed JSON ({type(error).__name__})") from None
     category = meta.get("model_cat") if isinstance(meta, dict) else None
     if not isinstance(category, str) or not 0 < len(category) <= MAX_WORD or not category.isprintable():
-        raise ObjectError(f"{files.folder / META_FILE}: needs a 'model_cat', the category's name")
+        raise ObjectError(f"{files.folder / META_FILE}: needs a 'model_cat', the category's name (docs/objects.md)")
     return category
 
 
 def _part_names(semantics: bytes, folder: Path) -> dict[str, str]:
     """Semantic name by link, from lines of link, kind of joint, name."""
     try:
-        lines = [line.split() for line in semantics.decode("utf-8").splitlines()]
+        lines = [line.split() for line in semantics.decode("utf-8-sig").splitlines()]
     except UnicodeDecodeError:
         raise ObjectError(f"{folder / SEMANTICS_FILE}: not UTF-8 text") from None
     names = {}
@@ -113,19 +160,76 @@ def _part_names(semantics: bytes, folder: Path) -> dict[str, str]:
     return names
 
 
-def _read_meshes(files: ObjectFiles, urdf: Urdf) -> dict[str, bytes]:
-    """The bytes of every mesh file that the URDF names."""
-    names = urdf.mesh_files()
-    missing = [name for name in names if not files.exists(name)]
-    if missing:
-        raise ObjectError(
-            f"{files.folder}: {len(missing)} of {len(names)} mesh files are missing, such as {missing[0]}"
-        )
-    contents, left = {}, MAX_OBJECT_BYTES
-    for name in names:
-        contents[name] = files.read(name, min(left, meshes.MAX_OBJ_BYTES))
-        left -= len(contents[name])
-    return contents
+class _Meshes:
+    """The mesh files that a URDF names, each read and parsed once; what cannot be used is noted."""
+
+    def __init__(self, files: ObjectFiles, folder: Path) -> None:
+        self._files = files
+        self._folder = folder
+        self._parsed: dict[str, Mesh] = {}
+        self._elsewhere: list[str] = []
+        self.unusable: dict[str, str] = {}
+        """Why, by the name that the URDF has."""
+        self._bytes = self._triangles = 0
+
+    def load(self, name: str) -> bytes | None:
+        """Read and parse the file that the URDF calls `name`; returns its bytes, None where it is absent.
+
+        Raises:
+            ObjectError: it is none below the folder, unreadable, or beyond a bound.
+        """
+        file = self._below_folder(name)
+        if not self._files.is_file(file):
+            self.unusable[name] = "is no file, or a link to none" if self._files.exists(file) else "is absent"
+            return None
+        data = self._files.read(file, min(MAX_OBJECT_BYTES - self._bytes, meshes.MAX_OBJ_BYTES))
+        self._bytes += len(data)
+        try:
+            mesh = meshes.parse_mesh(data, file)
+        except meshes.MeshSizeError as error:
+            raise ObjectError(f"{self._folder}: {error}") from None
+        except ObjectError as error:
+            self.unusable[name] = f"cannot be used: {str(error).removeprefix(f'{file}: ')}"
+            return data
+        self._triangles += len(mesh.faces)
+        if self._triangles > MAX_OBJECT_TRIANGLES:
+            raise ObjectError(f"{self._folder}: more than {MAX_OBJECT_TRIANGLES} triangles in all")
+        self._parsed[name] = mesh
+        return data
+
+    def get(self, name: str) -> Mesh | None:
+        """The mesh of that name; None where it cannot be used."""
+        return self._parsed.get(name)
+
+    def notes(self) -> Iterator[str]:
+        """What was left out, and what was found under another path."""
+        if self.unusable:
+            why = _listed([f"{short(name)} {reason}" for name, reason in self.unusable.items()])
+            yield f"{len(self.unusable)} of {len(self.unusable) + len(self._parsed)} meshes left out: {why}"
+        if self._elsewhere:
+            yield f"{len(self._elsewhere)} meshes found by the ends of their paths ({_listed(self._elsewhere)})"
+
+    def _below_folder(self, name: str) -> str:
+        """The path below the folder of the file that the URDF calls `name`.
+
+        Of a URI, an absolute path or one that leads out of the folder it is the longest end that is there: whoever
+        wrote it had the folder elsewhere.
+        """
+        _, separator, rest = name.partition("://")
+        parts = PurePosixPath((unquote(rest) if separator else name).replace("\\", "/")).parts
+        outside = [k for k, part in enumerate(parts) if part in ("..", "/") or part.endswith(":")]
+        if not separator and not outside and "\\" not in name:
+            return name
+        last = max(outside, default=-1)
+        ends = ["/".join(parts[k:]) for k in range(last + 1, len(parts))]
+        found = next((end for end in ends if self._files.is_file(end)), None)
+        if found is None:
+            raise ObjectError(
+                f"{self._folder}: the mesh {short(name)} is not a plain path below the object's folder, and no file "
+                "in it has the end of that path; copy the file there and name it relative to the URDF (docs/objects.md)"
+            )
+        self._elsewhere.append(short(name))
+        return found
 
 
 @dataclass(slots=True)
@@ -137,6 +241,8 @@ class _Growing:
     joint: Joint | None
     visuals: list[Mesh] = field(default_factory=list)
     collisions: list[Mesh] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+    """Mesh files that cannot be used."""
 
     def body(self) -> Body:
         visuals = tuple(self.visuals)
@@ -144,17 +250,21 @@ class _Growing:
 
 
 class _Bodies:
-    """Merges the links of a URDF into bodies, parsing each mesh file once."""
+    """Merges the links of a URDF into bodies."""
 
-    def __init__(self, urdf: Urdf, mesh_bytes: Mapping[str, bytes], names: Mapping[str, str], folder: Path) -> None:
+    def __init__(self, urdf: Urdf, found: _Meshes, names: Mapping[str, str], folder: Path) -> None:
         self._urdf = urdf
         self._names = names
         self._folder = folder
-        self._parsed = {name: meshes.parse_obj(data, str(folder / name)) for name, data in mesh_bytes.items()}
+        self._found = found
         self._vertices = 0
 
     def merged(self) -> tuple[Body, ...]:
-        """Body 0 is the root; the others follow in the order of the URDF's joints."""
+        """Body 0 is the root; the others follow in the order of the URDF's joints.
+
+        Raises:
+            ObjectError: a part has no shape but meshes that cannot be used, or there are too many vertices.
+        """
         root = self._urdf.root
         bodies = [_Growing(root, self._names.get(root, ""), None)]
         self._add_link(bodies[0], root, np.eye(4))
@@ -171,6 +281,11 @@ class _Bodies:
                 bodies[index].part_name = self._names.get(joint.child, "")
             place[joint.child] = index, body_from_child
             self._add_link(bodies[index], joint.child, body_from_child)
+        for body in bodies[1:]:
+            if body.lost and not body.visuals and not body.collisions:
+                mesh = body.lost[0]
+                why = f"{short(mesh)} {self._found.unusable[mesh]}"
+                raise ObjectError(f"{self._folder}: the movable part {short(body.link)} keeps no shape: {why}")
         return tuple(body.body() for body in bodies)
 
     def _add_link(self, body: _Growing, name: str, body_from_link: Float) -> None:
@@ -179,6 +294,9 @@ class _Bodies:
         kept: dict[tuple[object, ...], Mesh] = {}
         for shapes, meshes_of_body in ((link.visuals, body.visuals), (link.collisions, body.collisions)):
             for shape in shapes:
+                if shape.kind == "mesh" and self._found.get(shape.file) is None:
+                    body.lost.append(shape.file)
+                    continue
                 key = (shape.kind, shape.file, shape.size.tobytes(), shape.link_from_shape.tobytes())
                 if key not in kept:
                     kept[key] = self._mesh(shape, body_from_link)
@@ -194,7 +312,9 @@ class _Bodies:
     def _local_mesh(self, shape: Shape) -> tuple[Mesh, Float | None]:
         match shape.kind:
             case "mesh":
-                return self._parsed[shape.file], None if (shape.size == 1).all() else shape.size
+                mesh = self._found.get(shape.file)
+                assert mesh is not None
+                return mesh, None if (shape.size == 1).all() else shape.size
             case "box":
                 return meshes.box(shape.size), None
             case "cylinder":

@@ -1,6 +1,6 @@
 """What a worker tells of a job; no engine is imported for it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,6 +16,7 @@ class Receipt:
         seconds: wall time by stage, and "total".
         quarantined: rollouts that were not executed, since they had failed again and again.
         memory_mb: what the worker's process held in the end.
+        empty: by status and by object, rollouts that were executed and gave no interaction.
     """
 
     shard_id: str
@@ -26,3 +27,4 @@ class Receipt:
     seconds: dict[str, float]
     quarantined: int = 0
     memory_mb: float = 0.0
+    empty: dict[str, dict[str, int]] = field(default_factory=dict)

@@ -32,11 +32,15 @@ def run_rollout(
         make_proposer: makes the proposers that the plan needs.
         clock: sums wall time by stage.
     """
+    rested = False
     for attempt in range(TRIES):
         draw = draw_rollout(plan, index, attempt)
         environment = make_environment(plan, draw, target, clock, attempt)
         states = seeds.generator(plan.setting.seed, f"states/{plan.key}", index, attempt)
-        if not (environment.reset(states) and environment.shows_a_target()):
+        if not environment.reset(states):
+            continue
+        rested = True
+        if not environment.shows_a_target():
             continue
         recorder = Recorder(environment, plan.policy_version)
         if plan.setting.kind == "evaluation":
@@ -44,7 +48,15 @@ def run_rollout(
         else:
             collect(plan, index, recorder, states, make_proposer, clock)
         return _record(plan, draw, RolloutStatus.OK, recorder)
-    return _record(plan, draw, RolloutStatus.NOTHING_TO_ACT_ON, None)
+    return _record(plan, draw, RolloutStatus.NOTHING_TO_ACT_ON if rested else RolloutStatus.NEVER_AT_REST, None)
+
+
+def draws_at_rest(plan: Plan, index: int, target: ArticulatedObject) -> int:
+    """How many of the draws that a rollout may make come to rest."""
+    clock = StageClock()
+    environments = [make_environment(plan, draw_rollout(plan, index, k), target, clock, k) for k in range(TRIES)]
+    states = [seeds.generator(plan.setting.seed, f"states/{plan.key}", index, k) for k in range(TRIES)]
+    return sum(environment.reset(rng) for environment, rng in zip(environments, states, strict=True))
 
 
 def quarantined_rollout(plan: Plan, index: int) -> RolloutRecord:

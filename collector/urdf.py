@@ -22,6 +22,8 @@ MAX_LINKS = 500
 MAX_SHAPES = 5_000
 MAX_NUMBER = 1e6
 MAX_NAME = 200
+MAX_PATH = 1000
+MESH_ENDINGS = (".obj", ".stl")
 
 JointKind = Literal["fixed", "revolute", "continuous", "prismatic"]
 ShapeKind = Literal["mesh", "box", "cylinder", "sphere"]
@@ -37,7 +39,7 @@ class Shape:
     size: Float
     """Scale of a mesh [3], edges of a box [3], radius and length of a cylinder [2], radius of a sphere [1]."""
     file: str = ""
-    """Of a mesh, relative to the URDF."""
+    """Of a mesh, as written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,8 @@ class UrdfJoint:
     """[3], unit, in the child's frame."""
     lower: float
     upper: float
+    mimics: str = ""
+    """The joint that a `<mimic>` names; "" where there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,10 +204,15 @@ def _shape(element: Element) -> Shape:
 
 
 def _mesh_file(mesh: Element) -> str:
-    """The file's plain path; that it stays below the folder is checked where it is read."""
-    name = mesh.get("filename", "")
-    if not name or len(name) > MAX_NAME or not name.isprintable() or not name.lower().endswith(".obj"):
-        raise ObjectError(f"a mesh must name an .obj file of at most {MAX_NAME} characters; given {short(name)}")
+    """The file's path as written; which file below the folder that is, is found where it is read."""
+    name = mesh.get("filename", "").strip()
+    if not name or len(name) > MAX_PATH or not name.isprintable():
+        raise ObjectError(f"a mesh must name a file in at most {MAX_PATH} characters; given {short(name)}")
+    if not name.lower().endswith(MESH_ENDINGS):
+        raise ObjectError(
+            f"a mesh must be a file of {' or '.join(MESH_ENDINGS)}; given {short(name)}: convert it, for instance by "
+            "trimesh.load(FILE, force='mesh').export('NAME.obj'), and name that instead (docs/objects.md)"
+        )
     return name
 
 
@@ -222,7 +231,9 @@ def _joint(element: Element) -> UrdfJoint:
                 raise ObjectError("the axis is zero")
             axis = axis / length
         lower, upper = _limits(element, kind)
-        return UrdfJoint(name, cast(JointKind, kind), parent, child, _pose(element), axis, lower, upper)
+        mimic = element.find("mimic")
+        mimics = "" if mimic is None or kind == "fixed" else mimic.get("joint", "") or "no joint"
+        return UrdfJoint(name, cast(JointKind, kind), parent, child, _pose(element), axis, lower, upper, mimics)
     except ObjectError as error:
         raise ObjectError(f"joint {short(name)}: {error}") from None
 
@@ -240,7 +251,7 @@ def _limits(joint: Element, kind: str) -> tuple[float, float]:
         return -np.inf, np.inf
     limit = joint.find("limit")
     if limit is None:
-        raise ObjectError(f"a {kind} joint needs a <limit>")
+        raise ObjectError(f"a {kind} joint needs a <limit> (lower, upper); one that turns freely is 'continuous'")
     try:
         lower, upper = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
     except ValueError:
@@ -249,7 +260,7 @@ def _limits(joint: Element, kind: str) -> tuple[float, float]:
         if np.isnan(value) or (np.isfinite(value) and abs(value) > MAX_NUMBER):
             raise ObjectError(f"limits must be numbers, at most {MAX_NUMBER:g} or infinite; given {lower} to {upper}")
     if lower > upper:
-        raise ObjectError(f"the lower limit {lower} is above the upper limit {upper}")
+        raise ObjectError(f"the lower limit {lower} is above the upper limit {upper}, so it cannot move; exchange them")
     return lower, upper
 
 

@@ -123,6 +123,16 @@ class Worker:
         return proposer_named(name, self._adapters[version], rng, plan.most_tries)
 
 
+def _empty(records: Sequence[RolloutRecord]) -> dict[str, dict[str, int]]:
+    """How many rollouts were executed and gave nothing, by status and object."""
+    counts: dict[str, dict[str, int]] = {}
+    for record in records:
+        if not record.interactions and record.status is not RolloutStatus.QUARANTINED:
+            of_status = counts.setdefault(record.status.value, {})
+            of_status[record.object.id] = of_status.get(record.object.id, 0) + 1
+    return counts
+
+
 def _receipt(job: Job, records: Sequence[RolloutRecord], seconds: dict[str, float]) -> Receipt:
     outcomes = [row.outcome for record in records for row in record.interactions]
     return Receipt(
@@ -133,5 +143,6 @@ def _receipt(job: Job, records: Sequence[RolloutRecord], seconds: dict[str, floa
         outcomes=dict(Counter(outcome.kind.value for outcome in outcomes)),
         seconds=seconds,
         quarantined=sum(record.status is RolloutStatus.QUARANTINED for record in records),
+        empty=_empty(records),
         memory_mb=psutil.Process().memory_info().rss / 2**20,
     )

@@ -209,7 +209,7 @@ def read_object_list(path: Path | None) -> frozenset[str] | None:
     try:
         if path.stat().st_size > MAX_CONFIGURATION_BYTES:
             raise UsageError(f"{path}: larger than {MAX_CONFIGURATION_BYTES} bytes; not a list of objects")
-        names = frozenset(line.split()[0] for line in path.read_text(encoding="utf-8").splitlines() if line.split())
+        names = frozenset(line.split()[0] for line in path.read_text(encoding="utf-8-sig").splitlines() if line.split())
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: cannot be read ({error}); name a text file with one object id a line") from None
     if not names:

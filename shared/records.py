@@ -65,6 +65,8 @@ class RolloutStatus(StrEnum):
     OK = "ok"
     NOTHING_TO_ACT_ON = "nothing-to-act-on"
     """No draw of a camera and a state came to rest and showed a part that the task may act on."""
+    NEVER_AT_REST = "never-at-rest"
+    """No draw came to rest at all, so that none could be looked at: parts push each other, say."""
     QUARANTINED = "quarantined"
     """Its execution crashed, hung or failed again and again; the shard's manifest says how. Never a label."""
 

@@ -1,6 +1,7 @@
 """The real worker, whose rollouts come out of thin air instead of an engine, and end badly where they are told to."""
 
 import ctypes
+import errno
 import os
 import signal
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ class MisbehavingWorker(Worker):
 
     Args:
         store: the store's place.
-        mishaps: "crash", "hang", "raise" or "kill", by rollout.
+        mishaps: "crash", "hang", "raise", "library", "disk" or "kill", by rollout.
     """
 
     def __init__(self, store: Path, mishaps: Mapping[int, str]) -> None:
@@ -34,6 +35,10 @@ class MisbehavingWorker(Worker):
                 ctypes.PyDLL(None).sleep(600)
             case "raise":
                 raise RuntimeError("the engine\nexploded")
+            case "library":
+                raise ModuleNotFoundError("No module named 'coacd'")
+            case "disk":
+                raise OSError(errno.ENOSPC, "No space left on device")
             case "kill":
                 os.kill(os.getpid(), signal.SIGKILL)
         return fabricate_rollout(plan, index, interactions=4)

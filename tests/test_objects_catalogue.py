@@ -1,5 +1,7 @@
 """Catalogue, splits and previews."""
 
+import logging
+import os
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -9,11 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cluster.cli import run as adaafford
+from cluster.objects import objects_for
+from cluster.selection import ObjectSelection
 from collector import procedural
 from collector.catalogue import Catalogue, for_task, load, load_ref, qualifying_parts, read_list, scan, split
 from collector.preview import contact_sheet, part_colours, picture
 from shared.errors import ObjectError, UsageError
 from shared.plan import ObjectRef
+from shared.store import Store, verify
 from shared.tasks import TASKS
 
 CLOSED_DOOR, FAUCET = TASKS["pull-closed-door"], TASKS["push-faucet"]
@@ -81,12 +87,167 @@ def test_a_list_cannot_name_paths(tmp_path: Path, text: str) -> None:
         read_list(tmp_path / "list.txt")
 
 
+def test_a_list_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_bytes(b"\xef\xbb\xbfbox-0000 Box \r\nbox-0001 Box\r\n")
+    assert read_list(tmp_path / "list.txt") == ("box-0000", "box-0001")
+
+
 def test_a_list_that_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_bytes(b"\xff\xfe")
     with pytest.raises(UsageError, match="not text"):
         read_list(tmp_path / "list.txt")
     with pytest.raises(UsageError, match="cannot be read"):
         read_list(tmp_path / "none.txt")
+
+
+def linked(shelf: Path, cache: Path, links: Path, name: str = "box-0000") -> Path:
+    """An object whose files are links into a cache, as clients of model hubs keep what they download."""
+    for number, path in enumerate(path for path in (shelf / name).rglob("*") if path.is_file()):
+        cache.mkdir(parents=True, exist_ok=True)
+        blob = Path(shutil.copy(path, cache / f"{number:040x}"))
+        link = links / name / path.relative_to(shelf / name)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(os.path.relpath(blob, link.parent))
+    return links
+
+
+@pytest.mark.parametrize(
+    ("cache", "links"),
+    [
+        ("hub/blobs", "hub/snapshots/abc"),
+        ("hub/blobs", "hub/snapshots/abc/data/objects"),
+        ("repository/.dvc/cache/files", "repository/objects"),
+        ("repository/.git/annex/objects/a", "repository/data/objects"),
+        ("objects/.contents", "objects"),
+    ],
+)
+def test_links_into_the_cache_of_a_download_are_followed(shelf: Path, tmp_path: Path, cache: str, links: str) -> None:
+    objects = linked(shelf, tmp_path / cache, tmp_path / links)
+    (tmp_path / "shortcut").symlink_to(objects)
+    for path in (objects, tmp_path / "shortcut"):
+        (entry,) = scan(path).usable
+        assert entry.ref == scan(shelf / "box-0000").usable[0].ref
+        assert load(entry).ref == load_ref(path, entry.ref).ref == entry.ref
+
+
+def test_a_link_to_an_object_is_followed(shelf: Path, tmp_path: Path) -> None:
+    (tmp_path / "objects").mkdir()
+    for name in ("box-0000", "other-name"):
+        (tmp_path / "objects" / name).symlink_to(shelf / "box-0000")
+    entries = scan(tmp_path / "objects").usable
+    assert [entry.ref.id for entry in entries] == ["box-0000", "other-name"]
+    assert [load_ref(tmp_path / "objects", entry.ref).ref for entry in entries] == [entry.ref for entry in entries]
+    (alone,) = scan(tmp_path / "objects/other-name").usable
+    assert load_ref(tmp_path / "objects/other-name", alone.ref).ref == alone.ref
+
+
+@pytest.mark.parametrize("cache", ["elsewhere", "blobs", "snapshots/blobs"])
+def test_a_link_out_of_the_tree_is_not_followed_and_the_way_is_said(shelf: Path, tmp_path: Path, cache: str) -> None:
+    objects = linked(shelf, tmp_path / cache, tmp_path / "objects")
+    ((_, reason),) = scan(objects).refused
+    assert "is a link that leads out of the folder of objects" in reason
+    assert "cp -rL" in reason
+
+
+def test_what_a_link_steals_is_in_no_message(shelf: Path, tmp_path: Path) -> None:
+    objects = Path(shutil.copytree(shelf / "box-0000", tmp_path / "objects/box-0000")).parent
+    (tmp_path / "secret").write_text("the key is 1234\n")
+    mesh = next((objects / "box-0000").rglob("*.obj"))
+    mesh.unlink()
+    mesh.symlink_to(tmp_path / "secret")
+    ((_, reason),) = scan(objects).refused
+    assert "leads out" in reason
+    assert "1234" not in reason
+
+
+@pytest.mark.parametrize("name", ["mobility.urdf", "meta.json", "semantics.txt"])
+@pytest.mark.parametrize("target", ["nowhere", "itself", "folder"])
+def test_links_that_lead_to_no_file_are_refused_in_a_line(shelf: Path, tmp_path: Path, name: str, target: str) -> None:
+    folder = Path(shutil.copytree(shelf / "box-0000", tmp_path / "objects/box-0000"))
+    (tmp_path / "objects/folder").mkdir()
+    (folder / name).unlink()
+    (folder / name).symlink_to(folder / name if target == "itself" else folder.parent / target)
+    reason = dict(scan(tmp_path / "objects").refused)["box-0000"]
+    assert f"'{name}'" in reason
+    assert "\n" not in reason
+
+
+def overlapping_doors(folder: Path) -> Path:
+    """Two doors in one place push each other for ever."""
+    shape = "<geometry><box size='0.1 0.9 1.1'/></geometry>"
+    door = f"<origin xyz='0 -0.45 0'/>{shape}"
+    links = "".join(f"<link name='d{k}'><visual>{door}</visual><collision>{door}</collision></link>" for k in (1, 2))
+    joints = "".join(
+        f"<joint name='j{k}' type='revolute'><origin xyz='-0.3 0.45 0'/><parent link='body'/><child link='d{k}'/>"
+        "<axis xyz='0 0 1'/><limit lower='0' upper='1.57'/></joint>"
+        for k in (1, 2)
+    )
+    body = "<geometry><box size='0.4 1 1.2'/></geometry>"
+    (folder / "doors").mkdir(parents=True)
+    (folder / "doors/mobility.urdf").write_text(
+        f"<robot name='x'><link name='body'><visual>{body}</visual><collision>{body}</collision></link>"
+        f"{links}{joints}</robot>"
+    )
+    (folder / "doors/meta.json").write_text('{"model_cat": "StorageFurniture"}')
+    return folder
+
+
+def test_a_collection_of_what_never_rests_says_so_and_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    objects, store = overlapping_doors(tmp_path / "objects"), tmp_path / "store"
+    command = ["collect", "--objects", str(objects), "--store", str(store), "--rollouts", "2", "--workers", "0"]
+    for _ in range(2):
+        assert adaafford(command) == 1
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert "holds no interaction of random-v0: 2 rollouts gave no interaction: 2 never at rest (doors 2)" in said
+    assert Store.open(store).rollouts().column("status").to_pylist() == ["never-at-rest"] * 2
+    assert verify(Store.open(store)) == []
+    assert adaafford(["store", "info", str(store)]) == 0
+    printed = capsys.readouterr().out
+    assert "2: never-at-rest 2" in printed
+    assert "nan" not in printed
+    assert adaafford(["objects", "check", str(objects), "--settle"]) == 2
+    assert "comes to rest in none of 8 draws" in capsys.readouterr().out
+
+
+def test_a_store_goes_on_with_the_objects_that_it_was_begun_with(
+    shelf: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.copytree(shelf / "box-0000", tmp_path / "objects/box-0000")
+    command = ["collect", "--objects", str(tmp_path / "objects"), "--store", str(tmp_path / "store"), "--workers", "0"]
+    small = ["--collection.rollout.interactions", "1", "--rollouts"]
+    assert adaafford([*command, *small, "1"]) == 0
+    shutil.copytree(shelf / "box-0001", tmp_path / "objects/box-0001")
+    with caplog.at_level(logging.WARNING):
+        assert adaafford([*command, *small, "2"]) == 0
+    assert "was begun with 1 of the 2 objects that can be used" in caplog.text
+    assert [ref.id for ref in Store.open(tmp_path / "store").setting.objects] == ["box-0000"]
+    shutil.rmtree(tmp_path / "objects/box-0000")
+    assert adaafford([*command, *small, "3"]) == 2
+
+
+def test_what_is_left_out_is_said_before_collection(
+    shelf: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path(shutil.copytree(shelf / "box-0000", tmp_path / "objects/box-0000"))
+    urdf = folder / "mobility.urdf"
+    shape = '<visual><geometry><mesh filename="textured_objs/new-1.obj"/></geometry></visual></link>'
+    urdf.write_text(urdf.read_text().replace("</link>", shape, 1))
+    selection = ObjectSelection(objects=tmp_path / "objects")
+    with caplog.at_level(logging.WARNING):
+        objects_for(TASKS["push"], selection, tmp_path / "none", 1, 1)
+    assert "object box-0000: 1 of " in caplog.messages[0]
+    assert "left out: 'textured_objs/new-1.obj' is absent" in caplog.messages[0]
+    assert adaafford(["objects", "check", str(tmp_path / "objects")]) == 0
+    assert "left out: 'textured_objs/new-1.obj' is absent" in capsys.readouterr().out
+
+
+def test_hostile_names_of_folders_are_shown_as_escapes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "ok\n\x1b[2Jbox-0000  usable\u202e").mkdir()
+    (tmp_path / "ok\n\x1b[2Jbox-0000  usable\u202e/mobility.urdf").write_text("<robot/>")
+    assert adaafford(["objects", "check", str(tmp_path)]) == 2
+    printed = capsys.readouterr().out
+    assert len(printed.splitlines()) == 2
+    assert not {"\x1b", "\u202e"} & set(printed)
 
 
 def test_loading_gives_the_object_that_was_catalogued(shelf: Path, tmp_path: Path) -> None:

@@ -134,13 +134,19 @@ def test_the_hash_changes_if_and_only_if_the_content_does(folder: Path) -> None:
     assert len(seen) == 5
 
 
-def _truncate(folder: Path) -> None:
-    path = folder / "textured_objs/cube.obj"
-    path.write_bytes(path.read_bytes()[: -len("2//1 6//1 8//1 4//1\n") + 3])
-
-
 def _deep_json(folder: Path) -> None:
     (folder / "meta.json").write_text("[" * 200_000)
+
+
+def _spoiled(data: bytes | None) -> Callable[[Path], None]:
+    """The door's only mesh is unusable, or absent, and nothing else of it has a shape."""
+
+    def spoil(folder: Path) -> None:
+        edit(folder, '<visual><geometry><cylinder radius="0.1" length="1"/></geometry></visual>', "")
+        edit(folder, '<collision><geometry><sphere radius="0.5"/></geometry></collision>', "")
+        (folder / CUBE).unlink() if data is None else (folder / CUBE).write_bytes(data)
+
+    return spoil
 
 
 def _many_links(folder: Path) -> None:
@@ -189,6 +195,7 @@ def _removed(name: str) -> Callable[[Path], None]:
     return lambda folder: (folder / name).unlink()
 
 
+DOOR_MESH = '<visual><origin xyz="-1 0 0"/><geometry><mesh filename="textured_objs/door.obj"/>'
 BOMB = (
     b'<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa">'
     + b"".join(b'<!ENTITY b%d "%s">' % (i, (b"&b%d;" % (i - 1) if i else b"&a;") * 10) for i in range(9))
@@ -198,22 +205,22 @@ CUBE = "textured_objs/cube.obj"
 HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "no URDF": (_removed("mobility.urdf"), "is missing"),
     "no meta": (_removed("meta.json"), "is missing"),
-    "missing mesh": (_removed(CUBE), "1 of 1 mesh files are missing, such as textured_objs/cube.obj"),
-    "truncated OBJ": (_truncate, "truncated"),
-    "empty OBJ": (_written(CUBE, b""), "no faces"),
-    "OBJ cut before its faces": (_written(CUBE, b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"), "no faces"),
-    "OBJ half a vertex": (_written(CUBE, b"v 0 0 0\nv 1 0\nf 1 1 1\n"), "vertex 2 has 2 numbers"),
-    "OBJ half a face": (_written(CUBE, b"v 0 0 0\nv 1 0 0\nf 1 2\n"), "2 corners"),
-    "OBJ half a corner": (_written(CUBE, b"v 0 0 0\nf 1/1 1/1 1/"), "incomplete"),
-    "OBJ index out of range": (_written(CUBE, b"v 0 0 0\nf 1 1 2\n"), "among the 1"),
-    "OBJ index zero": (_written(CUBE, b"v 0 0 0\nf 0 1 1\n"), "among the 1"),
-    "OBJ negative index too low": (_written(CUBE, b"v 0 0 0\nf -1 -1 -2\n"), "among the 1"),
-    "OBJ giant index": (_written(CUBE, b"v 0 0 0\nf 1 1 99999999999999999999999\n"), "not a vertex number"),
-    "OBJ not a number": (_written(CUBE, b"v 0 0 zero\nf 1 1 1\n"), "not a number"),
-    "OBJ NaN": (_written(CUBE, b"v 0 0 nan\nf 1 1 1\n"), "not finite"),
-    "OBJ infinite": (_written(CUBE, b"v 0 0 -inf\nf 1 1 1\n"), "not finite"),
-    "OBJ binary": (_written(CUBE, bytes(range(256))), "not a Wavefront OBJ statement"),
-    "OBJ unknown statement": (_written(CUBE, b"v 0 0 0\nf 1 1 1\ncall other.obj\n"), "not a Wavefront OBJ statement"),
+    "missing mesh": (_spoiled(None), "the movable part 'door' keeps no shape: 'textured_objs/cube.obj' is absent"),
+    "truncated OBJ": (_spoiled(CUBE_OBJ.encode()[: -len("2//1 6//1 8//1 4//1\n") + 3]), "truncated"),
+    "empty OBJ": (_spoiled(b""), "no faces"),
+    "OBJ cut before its faces": (_spoiled(b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"), "no faces"),
+    "OBJ half a vertex": (_spoiled(b"v 0 0 0\nv 1 0\nf 1 1 1\n"), "vertex 2 has 2 numbers"),
+    "OBJ half a face": (_spoiled(b"v 0 0 0\nv 1 0 0\nf 1 2\n"), "2 corners"),
+    "OBJ half a corner": (_spoiled(b"v 0 0 0\nf 1/1 1/1 1/"), "incomplete"),
+    "OBJ index out of range": (_spoiled(b"v 0 0 0\nf 1 1 2\n"), "among the 1"),
+    "OBJ index zero": (_spoiled(b"v 0 0 0\nf 0 1 1\n"), "among the 1"),
+    "OBJ negative index too low": (_spoiled(b"v 0 0 0\nf -1 -1 -2\n"), "among the 1"),
+    "OBJ giant index": (_spoiled(b"v 0 0 0\nf 1 1 99999999999999999999999\n"), "not a vertex number"),
+    "OBJ not a number": (_spoiled(b"v 0 0 zero\nf 1 1 1\n"), "not a number"),
+    "OBJ NaN": (_spoiled(b"v 0 0 nan\nf 1 1 1\n"), "not finite"),
+    "OBJ infinite": (_spoiled(b"v 0 0 -inf\nf 1 1 1\n"), "not finite"),
+    "OBJ binary": (_spoiled(bytes(range(256))), "not a Wavefront OBJ statement"),
+    "OBJ unknown statement": (_spoiled(b"v 0 0 0\nf 1 1 1\ncall other.obj\n"), "not a Wavefront OBJ statement"),
     "malformed XML": (_replaced("</robot>", "</robo"), "malformed XML"),
     "XML in an unknown encoding": (_written("mobility.urdf", b'<?xml version="1.0" encoding="nil"?><a/>'), "malformed"),
     "not XML": (_written("mobility.urdf", b"\0\1\2"), "malformed XML"),
@@ -230,12 +237,18 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "path escape": (_replaced('"textured_objs/cube.obj"/>', '"../secret.obj"/>'), "not a plain path"),
     "absolute path": (_replaced('"textured_objs/cube.obj"/>', '"/etc/secret.obj"/>'), "not a plain path"),
     "escape by a link": (_escape_by_link, "leads out"),
-    "not an OBJ": (_replaced('"textured_objs/cube.obj"/>', '"cube.stl"/>'), "must name an .obj file"),
+    "not an OBJ": (_replaced('"textured_objs/cube.obj"/>', '"cube.dae"/>'), "a mesh must be a file of .obj or .stl"),
     "cycle": (_replaced('<parent link="base"/>', '<parent link="lock"/>'), "cycle"),
     "cycle of everything": (
         _replaced("</robot>", '<joint name="j" type="fixed"><parent link="lock"/><child link="base"/></joint></robot>'),
         "no root link",
     ),
+    "foreign URI": (
+        _replaced('"textured_objs/cube.obj"/>', '"package://door/meshes/door.obj"/>'),
+        "copy the file there and name it relative to the URDF (docs/objects.md)",
+    ),
+    "large OBJ": (_written(CUBE, b"#" * (meshes.MAX_OBJ_BYTES + 1)), "at most"),
+    "OBJ of one long line": (_written(CUBE, b"v " + b"1 " * (3 << 20)), "a line of more than"),
     "several roots": (_replaced("</robot>", '<link name="other"/></robot>'), "2 root links"),
     "two joints move a link": (
         _replaced("</robot>", '<joint name="j" type="fixed"><parent link="base"/><child link="lock"/></joint></robot>'),
@@ -246,6 +259,13 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "NaN limit": (_replaced('upper="1.5"', 'upper="nan"'), "limits must be numbers"),
     "giant limit": (_replaced('upper="1.5"', 'upper="1e300"'), "limits must be numbers"),
     "limit that is no number": (_replaced('upper="1.5"', 'upper="far"'), "not a number"),
+    "no joint that can move": (
+        lambda folder: (
+            edit(folder, 'lower="0" upper="1.5"', 'effort="30" velocity="1"'),
+            edit(folder, 'type="continuous"', 'type="fixed"'),
+        )[0],
+        "no joint can move, since the lower and the upper limit of each are the same (such as 0 and 0 of 'hinge')",
+    ),
     "no limit": (_replaced('<limit lower="0" upper="1.5"/>', ""), "needs a <limit>"),
     "limits reversed": (_replaced('lower="0" upper="1.5"', 'lower="1" upper="0"'), "above the upper limit"),
     "limits beyond pi": (_replaced('lower="0" upper="1.5"', 'lower="4" upper="inf"'), "leave nothing"),
@@ -291,6 +311,95 @@ def test_what_cannot_be_used_is_refused_with_one_line(folder: Path, name: str) -
     assert expected in message
     assert "\n" not in message
     assert len(message) < 500
+
+
+@pytest.mark.parametrize("data", [None, b"", b"v 0 0 nan\nf 1 1 1\n", b"v 0 0 0\n"])
+def test_a_mesh_that_is_absent_or_unusable_is_left_out_and_noted(folder: Path, data: bytes | None) -> None:
+    cube = (folder / CUBE).read_bytes()
+    (folder / "textured_objs/door.obj").write_bytes(cube)
+    edit(folder, '<visual><origin xyz="-1 0 0"/><geometry><mesh filename="textured_objs/cube.obj"/>', DOOR_MESH)
+    whole = read_object(folder)
+    assert whole.notes == ()
+    (folder / CUBE).unlink() if data is None else (folder / CUBE).write_bytes(data)
+    left = read_object(folder)
+    assert left.bodies[0].visuals == ()
+    assert len(left.bodies[0].collisions) == 1
+    assert len(left.bodies[1].visuals) == 2
+    assert left.notes[0].startswith("1 of 2 meshes left out: 'textured_objs/cube.obj' ")
+    assert left.ref.content_hash != whole.ref.content_hash
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "package://door/textured_objs/cube.obj",
+        "file:///home/me/my%20door/textured_objs/cube.obj",
+        "/home/me/door/textured_objs/cube.obj",
+        "C:\\door\\textured_objs\\cube.obj",
+        "../textured_objs/cube.obj",
+    ],
+)
+def test_a_path_of_elsewhere_is_found_by_its_end(folder: Path, name: str) -> None:
+    edit(folder, '"textured_objs/cube.obj"/>', f'"{name}"/>')
+    described = read_object(folder)
+    assert len(described.bodies[1].visuals) == 2
+    assert "found by the ends of their paths" in described.notes[0]
+
+
+def test_an_urdf_that_is_derived_is_read_where_the_first_is_missing(folder: Path) -> None:
+    (folder / "mobility.urdf").rename(folder / "mobility_cvx.urdf")
+    assert read_object(folder).notes == ("read from mobility_cvx.urdf",)
+
+
+def test_joints_that_mimic_or_cannot_move_are_noted(folder: Path) -> None:
+    edit(folder, '<limit lower="0" upper="1.5"/>', '<limit lower="0" upper="1.5"/><mimic joint="lost"/>')
+    edit(folder, 'type="continuous">', 'type="revolute"><limit lower="1" upper="1"/>')
+    still, mimic = read_object(folder).notes
+    assert still == "1 of 2 joints cannot move, since both limits are the same ('turn')"
+    assert mimic == "<mimic> is not followed: what has it moves on its own ('hinge' of 'lost')"
+
+
+def test_byte_order_marks_and_line_ends_of_other_systems_change_nothing(folder: Path) -> None:
+    plain = read_object(folder)
+    for name in ("mobility.urdf", "meta.json", "semantics.txt", CUBE):
+        text = (folder / name).read_bytes().replace(b"\n", b" \r\n")
+        (folder / name).write_bytes(b"\xef\xbb\xbf" + text)
+    marked = read_object(folder)
+    assert [body.part_name for body in marked.bodies] == [body.part_name for body in plain.bodies]
+    assert marked.notes == ()
+    for ours, theirs in zip(marked.bodies, plain.bodies, strict=True):
+        assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(ours.visuals, theirs.visuals, strict=True))
+
+
+def test_stl_of_both_kinds_is_read() -> None:
+    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+    lines = "".join(f"vertex {x} {y} {z}\n" for x, y, z in corners)
+    ascii_mesh = meshes.parse_mesh(f"solid x\nfacet normal 0 0 1\nouter loop\n{lines}".encode(), "a.STL")
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
+    rows = np.zeros(2, record)
+    rows["corners"] = np.reshape(corners, (2, 9))
+    binary = b"solid, though binary".ljust(80) + (2).to_bytes(4, "little") + rows.tobytes()
+    binary_mesh = meshes.parse_mesh(binary, "b.stl")
+    for mesh in (ascii_mesh, binary_mesh):
+        assert len(mesh.vertices) == 4
+        assert np.array_equal(mesh.vertices[mesh.faces].reshape(-1, 3), corners)
+    for cut in (binary[:-1], b"", b"solid\nvertex 1 2\n", b"solid\nvertex 1 2 3\n", b"solid\nvertex 1 2 nan\n"):
+        with pytest.raises(ObjectError):
+            meshes.parse_mesh(cut, "c.stl")
+
+
+def test_an_obj_of_several_blocks_is_read_like_one_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    lines = [f"v {' '.join(map(repr, rng.normal(size=3).tolist()))}" for _ in range(50)]
+    lines += [f" f -{k} -{k + 1}  -{k + 2} {k}" for k in range(1, 40)] + ["v 1 2 3 1"]
+    data = "\r\n".join(lines).encode()
+    whole = meshes.parse_obj(data, "whole")
+    expected = [[float(word) for word in line.split()[1:4]] for line in lines if line.startswith("v")]
+    assert whole.vertices.tolist() == expected
+    monkeypatch.setattr(meshes, "_BLOCK_BYTES", 64)
+    blocks = meshes.parse_obj(data, "blocks")
+    assert np.array_equal(blocks.vertices, whole.vertices)
+    assert np.array_equal(blocks.faces, whole.faces)
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path: Path) -> None:

@@ -19,11 +19,11 @@ from cluster.fleet import SerialFleet
 from cluster.session import fleets
 from collector.guard import Limits
 from learner.data import load_dataset
-from shared.errors import StoreError
+from shared.errors import StoreError, WorkerError
 from shared.files import process_name
 from shared.plan import Job, Plan
 from shared.records import RolloutStatus
-from shared.store import Quarantined, Store, verify
+from shared.store import Quarantined, Store, compact, reopening, verify
 from shared.underway import Crumb, Underway, summary_of
 from tests.fabricate import fabricate_rollout, fabricate_setting
 from tests.misbehaving_worker import MisbehavingWorker
@@ -40,9 +40,12 @@ def new_store(path: Path) -> Store:
     return Store.create(path, fabricate_setting())
 
 
-def fill(store: Store, mishaps: Mapping[int, str]) -> Collected:
+def fill(
+    store: Store, mishaps: Mapping[int, str], per_shard: int = PER_SHARD, *, retry_quarantined: bool = False
+) -> Collected:
     fleet = SerialFleet(partial(MisbehavingWorker, store.path, mishaps))
-    return collect(store, Plan(setting=store.setting), ROLLOUTS, PER_SHARD, lambda: fleet, OBJECTS)
+    plan = Plan(setting=store.setting)
+    return collect(store, plan, ROLLOUTS, per_shard, lambda: fleet, OBJECTS, retry_quarantined=retry_quarantined)
 
 
 def rollout_digests(store: Store) -> dict[int, str]:
@@ -70,6 +73,90 @@ def test_a_rollout_that_always_raises_is_given_up_and_nothing_else(tmp_path: Pat
     assert len(load_dataset(disturbed, TINY).rollouts) == ROLLOUTS - 2
     assert collected.tally.rollouts == ROLLOUTS
     assert_only_these_are_missing(disturbed, undisturbed, {5, 6})
+
+
+@pytest.mark.parametrize("per_shard", [1, 2, 4, 12])
+@pytest.mark.parametrize("mishap", ["raise", "library", "disk"])
+def test_an_environment_in_which_nothing_succeeds_ends_the_collection_and_leaves_nothing(
+    tmp_path: Path, mishap: str, per_shard: int
+) -> None:
+    store = new_store(tmp_path)
+    with pytest.raises(WorkerError) as failure:
+        fill(store, dict.fromkeys(range(ROLLOUTS), mishap), per_shard)
+    said = "3 different rollouts failed in the same way" if mishap == "raise" else "failed 3 times; last: "
+    assert said in str(failure.value)
+    assert "reproduce it with: adaafford store replay" in str(failure.value)
+    assert store.jobs() == []
+    assert fill(store, {}, per_shard).tally.rollouts == ROLLOUTS
+
+
+@pytest.mark.parametrize("per_shard", [1, 2, 3])
+def test_an_environment_that_breaks_after_a_while_ends_the_collection(tmp_path: Path, per_shard: int) -> None:
+    store = new_store(tmp_path)
+    with pytest.raises(WorkerError, match="3 different rollouts failed in the same way"):
+        fill(store, dict.fromkeys(range(6, ROLLOUTS), "raise"), per_shard)
+    assert [(shard.stop, shard.quarantined) for shard in store.committed()][-1] == (6, ())
+    assert fill(store, {}, per_shard).tally.rollouts == ROLLOUTS - 6
+
+
+@pytest.mark.parametrize("per_shard", [1, 4])
+def test_a_single_rollout_that_fails_in_a_new_store_is_not_quarantined(tmp_path: Path, per_shard: int) -> None:
+    store = new_store(tmp_path)
+    fleet = SerialFleet(partial(MisbehavingWorker, store.path, {0: "raise"}))
+    with pytest.raises(WorkerError, match="no rollout succeeded, and rollout 0 failed again and again: RuntimeError"):
+        collect(store, Plan(setting=store.setting), 1, per_shard, lambda: fleet, OBJECTS)
+    assert store.jobs() == []
+
+
+@pytest.mark.parametrize("per_shard", [1, 4, 12])
+def test_the_first_rollout_is_quarantined_once_others_succeed(tmp_path: Path, per_shard: int) -> None:
+    disturbed, undisturbed = new_store(tmp_path / "disturbed"), new_store(tmp_path / "undisturbed")
+    assert fill(disturbed, {0: "raise", 1: "raise"}, per_shard).tally.quarantined == 2
+    fill(undisturbed, {})
+    assert_only_these_are_missing(disturbed, undisturbed, {0, 1})
+
+
+def test_the_last_rollout_of_a_store_is_quarantined_although_it_is_alone(tmp_path: Path) -> None:
+    store = new_store(tmp_path)
+    fill(store, {})
+    fleet = SerialFleet(partial(MisbehavingWorker, store.path, {ROLLOUTS: "raise"}))
+    plan = Plan(setting=store.setting)
+    assert collect(store, plan, ROLLOUTS + 1, PER_SHARD, lambda: fleet, OBJECTS).tally.quarantined == 1
+
+
+@pytest.mark.parametrize("compacted", [False, True])
+def test_quarantined_rollouts_that_are_executed_again_take_their_place(tmp_path: Path, compacted: bool) -> None:
+    disturbed, undisturbed = new_store(tmp_path / "disturbed"), new_store(tmp_path / "undisturbed")
+    fill(disturbed, {0: "raise", 5: "raise", 11: "raise"})
+    fill(undisturbed, {})
+    if compacted:
+        compact(disturbed, ROLLOUTS)
+    collected = fill(disturbed, {5: "raise"}, retry_quarantined=True)
+    assert (collected.tally.rollouts, collected.tally.quarantined) == (3, 1)
+    assert_only_these_are_missing(disturbed, undisturbed, {5})
+    assert fill(disturbed, {}, retry_quarantined=True).tally.rollouts == 1
+    assert disturbed.digest() == undisturbed.digest()
+    assert verify(disturbed) == []
+    assert fill(disturbed, {}, retry_quarantined=True).tally.rollouts == 0
+
+
+def test_a_kill_while_shards_are_reopened_loses_and_doubles_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disturbed, undisturbed = new_store(tmp_path / "disturbed"), new_store(tmp_path / "undisturbed")
+    fill(disturbed, {5: "raise"})
+    fill(undisturbed, {})
+    before = disturbed.digest()
+    for step in ("commit_shard", "set_aside"):
+        with monkeypatch.context() as patch:
+            patch.setattr(reopening, step, lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                fill(disturbed, {}, retry_quarantined=True)
+        assert disturbed.digest() == before
+        assert verify(disturbed) == []
+    fill(disturbed, {}, retry_quarantined=True)
+    assert disturbed.digest() == undisturbed.digest()
+    assert verify(disturbed) == []
 
 
 def test_a_store_says_what_was_given_up_and_how_to_see_it_happen(
@@ -156,7 +243,7 @@ def test_workers_that_are_lost_as_they_start_end_the_run_only_if_none_ever_lives
     for _ in range(3):
         for _ in range(2 * MAX_LOSSES - 1):
             blame.charge(JOB, start)
-        blame.acquit()
+        blame.acquit(Job("random-v0", 0, 4))
     with pytest.raises(JobError):
         for _ in range(2 * MAX_LOSSES):
             blame.charge(JOB, start)
@@ -233,6 +320,18 @@ def test_crashes_hangs_and_kills_cost_themselves_alone_on_ray(tmp_path: Path) ->
     assert reasons[6].startswith("took more than 0:00:02, in execute (misbehaving_worker.py:")
     assert reasons[7] == "RuntimeError: the engine exploded (3 times)"
     assert reasons[10].startswith("its process was lost without a word")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(("mishap", "said"), [("raise", "3 different rollouts failed"), ("library", "failed 3 times")])
+def test_a_broken_environment_ends_the_collection_on_ray(tmp_path: Path, mishap: str, said: str) -> None:
+    store = new_store(tmp_path)
+    with fleets(2, Limits()) as make:
+        fleet = make(partial(MisbehavingWorker, store.path, dict.fromkeys(range(ROLLOUTS), mishap)), store.underway)
+        with pytest.raises(WorkerError, match=said):
+            collect(store, Plan(setting=store.setting), ROLLOUTS, 1, lambda: fleet, OBJECTS)
+    assert all(not shard.quarantined for shard in store.committed())
 
 
 def test_a_replayed_rollout_crashes_before_ones_eyes(tmp_path: Path) -> None:

@@ -213,7 +213,8 @@ def test_logging_is_for_people_unless_machines_are_asked_for(monkeypatch: pytest
     given: list[dict[str, list[logging.Handler]]] = []
     monkeypatch.setattr(logging, "basicConfig", lambda **options: given.append(options))
     configure({})
-    assert isinstance(given[0]["handlers"][0].formatter, Lines)
+    (handler,) = given[0]["handlers"]  # type: ignore[misc]
+    assert isinstance(handler.formatter, Lines)
     levels = {name: logging.getLogger(name).level for name in ("cluster", "collector", "learner", "shared")}
     try:
         configure({"ADAAFFORD_LOG": "json"})

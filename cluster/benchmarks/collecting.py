@@ -13,7 +13,7 @@ from typing import Any
 
 from cluster.benchmarks.progress import Advance
 from cluster.progress import Tally
-from collector.partnet import URDF_FILE
+from collector.partnet import urdf_of
 from collector.published import PublishedRequest, PublishedTiming
 from collector.worker import Worker
 from shared.errors import UsageError, WorkerError
@@ -161,7 +161,7 @@ class CollectionBenchmark:
     def _publish_one(self, rollout: RolloutRecord, row: InteractionRecord) -> PublishedRun:
         own = self.folder / rollout.object.id
         request = PublishedRequest(
-            folder=self.folder if (self.folder / URDF_FILE).is_file() else own,
+            folder=self.folder if urdf_of(self.folder) is not None else own,
             part_mass=rollout.dynamics.part_mass,
             joint_friction=rollout.dynamics.joint_friction,
             surface_friction=rollout.dynamics.surface_friction,

@@ -1,10 +1,11 @@
 """`adaafford collect`: collection alone, into one store."""
 
+import logging
 import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from pydantic import Field
@@ -12,9 +13,14 @@ from pydantic import Field
 from cluster.selection import ObjectSelection, RayAddress
 from cluster.settings import early_flags, layered, parse_flags
 from shared.configuration import CollectionConfig
-from shared.errors import UsageError
+from shared.errors import StoreError, UsageError
 from shared.plan import ROLLOUTS_PER_SHARD
 from shared.tasks import task_named
+
+if TYPE_CHECKING:
+    from shared.plan import ObjectRef
+
+logger = logging.getLogger(__name__)
 
 
 class CollectSettings(ObjectSelection):
@@ -58,6 +64,8 @@ class CollectCommand:
     policy: int | Literal["latest"] = 0
     """Version of the policy in the store that the proposer uses; "aip" needs one. "latest": always the newest that is
     published, also by a learner that is at work at the same time (`adaafford learn --follow`)."""
+    retry_quarantined: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Execute the rollouts again that the store holds as quarantined, once what made them fail was mended."""
     config: Path | None = None
     """A TOML file of settings; flags are laid over it."""
 
@@ -75,6 +83,25 @@ def main(args: list[str]) -> int:
         raise UsageError("--per-version is about the versions of --policy latest; without that, give --rollouts alone")
     _collect(command)
     return 0
+
+
+def _begun_with(where: str, found: "tuple[ObjectRef, ...]") -> "tuple[ObjectRef, ...]":
+    """The objects that a store was begun with, if all of them are found; a later release may find usable ones more."""
+    from shared.store import Store
+
+    try:
+        known = Store.open(where).setting.objects
+    except StoreError:  # There is none yet, or what is wrong with it is said when it is made.
+        return found
+    if not set(known) < set(found):
+        return found
+    logger.warning(
+        "%s: was begun with %d of the %d objects that can be used; it goes on with these alone",
+        where,
+        len(known),
+        len(found),
+    )
+    return known
 
 
 def _collect(command: CollectCommand) -> None:
@@ -99,7 +126,7 @@ def _collect(command: CollectCommand) -> None:
     setting = Setting(
         task=chosen.task,
         seed=chosen.seed,
-        objects=tuple(entry.ref for entry in catalogue.usable),
+        objects=_begun_with(where, tuple(entry.ref for entry in catalogue.usable)),
         collection=task_named(chosen.task).resolve(chosen.collection),
     )
     store = Store.create(where, setting)
@@ -113,4 +140,12 @@ def _collect(command: CollectCommand) -> None:
     limits = Limits(chosen.rollout_limit_s, chosen.memory_limit_mb)
     with store.only_driver(), fleets(chosen.workers, limits, chosen.ray_address) as make_fleet:
         open_fleet = partial(make_fleet, partial(make_worker, where, folder), store.underway)
-        collect(store, plan, chosen.rollouts, chosen.per_shard, open_fleet, folder)
+        collect(
+            store,
+            plan,
+            chosen.rollouts,
+            chosen.per_shard,
+            open_fleet,
+            folder,
+            retry_quarantined=command.retry_quarantined,
+        )

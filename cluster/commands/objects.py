@@ -2,14 +2,20 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from pydantic import Field
 
 from cluster.settings import parse_flags
 from shared.errors import UsageError
+from shared.plain import plain
 from shared.vocabulary import Primitive
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from collector.catalogue import CatalogueEntry
 
 ACTIONS = ("generate", "check", "preview", "film", "decompose")
 
@@ -40,6 +46,8 @@ class CheckCommand:
     """Only the objects of this list, `<id> <category>` a line, such as Where2Act publishes."""
     categories: tuple[str, ...] = ()
     """Only objects of these; "train" and "test" stand for the paper's ten and five."""
+    settle: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Simulate as well whether usable objects come to rest, since a rollout begins with that; about a second each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +124,35 @@ def _check(command: CheckCommand) -> int:
     catalogue = of_categories(scan(command.path, *lists), expanded(command.categories))
     if command.task is not None:
         catalogue = for_task(catalogue, task_named(command.task))
-    lines = {entry.ref.id: f"usable: {entry.ref.category}, {_parts(len(entry.parts))}" for entry in catalogue.usable}
-    lines |= {object_id: f"refused: {reason}" for object_id, reason in catalogue.refused}
-    for object_id in sorted(lines):
-        print(f"{object_id}  {lines[object_id]}")
-    print(f"{len(catalogue.usable)} usable, {len(catalogue.refused)} refused")
-    return 0 if catalogue.usable else UsageError.exit_code
+    described = {object_id: f"refused: {reason}" for object_id, reason in catalogue.refused}
+    described |= dict.fromkeys((entry.ref.id for entry in catalogue.usable), "")
+    entries, restless = {entry.ref.id: entry for entry in catalogue.usable}, 0
+    for object_id in sorted(described):
+        line = described[object_id]
+        if object_id in entries:
+            entry = entries[object_id]
+            line = "; ".join([f"usable: {entry.ref.category}, {_parts(entry.movable)}", *entry.notes])
+            if command.settle:
+                rests, draws = _draws_at_rest(entry, command.task)
+                line += f"; comes to rest in {rests or 'none'} of {draws} draws"
+                restless += not rests
+        print(plain(f"{object_id}  {line}"), flush=True)
+    said = f", {restless} of these never at rest, so that nothing can be collected of them" if restless else ""
+    print(f"{len(catalogue.usable)} usable{said}, {len(catalogue.refused)} refused")
+    return 0 if len(catalogue.usable) > restless else UsageError.exit_code
+
+
+def _draws_at_rest(entry: "CatalogueEntry", task: str | None) -> tuple[int, int]:
+    """How many of the draws of a rollout come to rest, and how many there are."""
+    from collector.catalogue import load
+    from collector.rollout import TRIES, draws_at_rest
+    from shared.configuration import CollectionConfig
+    from shared.plan import Plan, Setting
+    from shared.tasks import task_named
+
+    named = task_named(task or "push")
+    setting = Setting(task=named.name, seed=1, objects=(entry.ref,), collection=named.resolve(CollectionConfig()))
+    return draws_at_rest(Plan(setting=setting), 0, load(entry)), TRIES
 
 
 def _preview(command: PreviewCommand) -> int:
@@ -144,7 +175,7 @@ def _film(command: FilmCommand) -> int:
         raise UsageError(f"{command.path}: a film needs a usable object and a primitive; try `adaafford objects check`")
     for caption in film(load(usable[0]), command.primitives, command.seed, command.out):
         print(caption)
-    print(f"{command.out}: {usable[0].ref.id}, {usable[0].ref.category}")
+    print(plain(f"{command.out}: {usable[0].ref.id}, {usable[0].ref.category}"))
     return 0
 
 
@@ -168,14 +199,17 @@ def _decompose(command: DecomposeCommand) -> int:
                 opened = decomposer.decomposed(target, show)
             except ObjectError as error:
                 failed += 1
-                bar.console.print(f"{entry.ref.id}  refused: {error}", markup=False, highlight=False, soft_wrap=True)
+                _say(bar.console, f"{entry.ref.id}  refused: {error}")
             else:
                 meshes, pieces = (sum(len(body.collisions) for body in o.bodies) for o in (target, opened))
-                said = f"{entry.ref.id}  {meshes} meshes, {pieces} convex pieces"
-                bar.console.print(said, markup=False, highlight=False, soft_wrap=True)
+                _say(bar.console, f"{entry.ref.id}  {meshes} meshes, {pieces} convex pieces")
             bar.remove_task(task)
     print(f"{len(usable) - failed} decomposed into {cache_folder()}, {failed} refused")
     return 0 if failed < len(usable) else UsageError.exit_code
+
+
+def _say(console: "Console", line: str) -> None:
+    console.print(plain(line), markup=False, highlight=False, soft_wrap=True)
 
 
 def _parts(count: int) -> str:

@@ -89,11 +89,13 @@ def table(standing: "Standing", now: float) -> "Table":
     from rich.table import Table
     from rich.text import Text
 
+    from shared.plain import plain
+
     shown = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
 
     def row(name: str, value: str) -> None:
         # As plain text: names and files may hold what rich takes for markup, or a terminal for commands.
-        shown.add_row(Text(name, style="dim"), Text("".join(filter(str.isprintable, value))))
+        shown.add_row(Text(name, style="dim"), Text(plain(value)))
 
     if standing.what != "store":
         row(standing.what, standing.where)

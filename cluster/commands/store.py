@@ -13,6 +13,7 @@ import tyro
 
 from cluster.settings import parse_flags
 from shared.errors import UsageError
+from shared.plain import plain
 
 if TYPE_CHECKING:
     from cluster.resimulation import Divergence
@@ -118,21 +119,24 @@ def _info(command: InfoCommand) -> int:
         return 0
 
     def tallies(counts: dict[str, Tally]) -> str:
-        return ", ".join(f"{name} {tally.interactions} ({tally.success_rate:.1%})" for name, tally in counts.items())
+        each = [f"{plain(name)} {tally.interactions} ({tally.success_rate:.1%})" for name, tally in counts.items()]
+        return ", ".join(each) or "none"
 
+    per_interaction = f", {held.bytes_per_interaction:.0f} B/interaction" if held.interactions else ""
     print(f"{command.store}: {store.setting.kind}, task {store.setting.task}, seed {store.setting.seed}")
     print(f"  objects       {len(store.setting.objects)}")
-    print(f"  shards        {held.shards}, {held.bytes / 1e6:.1f} MB, {held.bytes_per_interaction:.0f} B/interaction")
-    print(f"  rollouts      {held.rollouts}: {', '.join(f'{name} {n}' for name, n in held.by_status.items())}")
+    print(f"  shards        {held.shards}, {held.bytes / 1e6:.1f} MB{per_interaction}")
+    print(f"  rollouts      {held.rollouts}: {', '.join(f'{plain(name)} {n}' for name, n in held.by_status.items())}")
     print(f"  interactions  {held.interactions}, on {held.observations} observations")
-    print(f"  outcomes      {', '.join(f'{name} {n}' for name, n in held.by_outcome.items())}")
+    print(f"  outcomes      {', '.join(f'{plain(name)} {n}' for name, n in held.by_outcome.items()) or 'none'}")
     print(f"  proposers     {tallies(held.by_proposer)}")
     print(f"  roles         {tallies(held.by_role)}")
     print(f"  categories    {tallies(held.by_category)}")
     if held.quarantined:
         print(f"  quarantined   {len(held.quarantined)}")
     for each in held.quarantined[:MOST_QUARANTINED]:
-        print(f"    rollout {each.rollout}: {each.reason}\n      {each.command}")
+        print(plain(f"    rollout {each.rollout}: {each.reason}"))
+        print(plain(f"      {each.command}"))
     print(f"  policies      {', '.join(map(str, store.policy_versions())) or 'none'}")
     return 0
 
@@ -155,7 +159,7 @@ def _verify(command: VerifyCommand) -> int:
         print(json.dumps(_finite(said), indent=2))
         return 1 if problems else 0
     for problem in problems:
-        print(f"{problem.where}: {problem.what}")
+        print(plain(f"{problem.where}: {problem.what}"))
     print(f"{len(problems)} problems" if problems else f"no problems in {len(store.committed())} shards")
     if divergence is not None:
         _print_divergence(divergence)

@@ -9,6 +9,7 @@ import tyro
 
 from cluster.settings import parse_flags
 from shared.errors import UsageError
+from shared.plain import plain
 
 MOST_SHOWN = 20
 """Lines of one kind that are printed; --json has all."""
@@ -95,11 +96,11 @@ def _repair(command: RepairCommand) -> int:
         print(json.dumps(asdict(done) | {"to_collect": jobs, "commands": commands}, indent=2))
         return 0
     for problem in done.problems:
-        print(f"{problem.where}: {problem.what}")
+        print(plain(f"{problem.where}: {problem.what}"))
     for key in done.set_aside:
-        print(f"set aside      {key}")
+        print(plain(f"set aside      {key}"))
     for key in done.made_anew:
-        print(f"made anew      {key}")
+        print(plain(f"made anew      {key}"))
     for version in done.lost_policies:
         print(f"policy lost    {version}; what it proposed stays, but it cannot propose again")
     for line in commands[:MOST_SHOWN]:

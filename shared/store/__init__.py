@@ -6,6 +6,7 @@ from shared.store.info import StoreInfo, Tally, info
 from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
 from shared.store.merging import Merged, merge
 from shared.store.observations import ObservationArrays
+from shared.store.reopening import reopen_quarantined
 from shared.store.repair import Repair, repair
 from shared.store.store import Store
 from shared.store.verify import Problem, verify
@@ -28,6 +29,7 @@ __all__ = [
     "export",
     "info",
     "merge",
+    "reopen_quarantined",
     "repair",
     "verify",
 ]

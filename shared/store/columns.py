@@ -127,7 +127,7 @@ def _rollout_columns() -> tuple[Column[RolloutRow], ...]:
         Column("elevation_deg", "<f8", 0, "camera", lambda x: r(x).elevation_deg),
         Column("seed", "<u8", 0, "the plan's seed", lambda x: r(x).seed),
         Column("fidelity", "", 0, "name of the preset", lambda x: r(x).fidelity),
-        Column("status", "", 0, "ok, nothing-to-act-on or quarantined", lambda x: r(x).status),
+        Column("status", "", 0, "ok, nothing-to-act-on, never-at-rest or quarantined", lambda x: r(x).status),
         Column("observations", "<i8", 0, "how many", lambda x: len(r(x).observations)),
         Column("interactions", "<i8", 0, "how many", lambda x: len(r(x).interactions)),
         Column("first_observation", "<i8", 0, "index in the shard", lambda x: x.first_observation, content=False),

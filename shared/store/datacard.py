@@ -1,9 +1,11 @@
 """The card of exported data: what it is, how much, how often things succeed, where it comes from, who may use it."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from shared.plain import markdown
 from shared.store.store import Store
 from shared.vocabulary import OutcomeKind
 
@@ -70,7 +72,7 @@ def data_card(store: Store, splits: dict[str, SplitFigures]) -> str:
         "",
         "## How trials ended",
         "",
-        *(f"- {name}: {', '.join(f'{k} {n}' for k, n in sorted(f.outcomes.items()))}" for name, f in splits.items()),
+        *(f"- {name}: {_listed(f.outcomes)}" for name, f in splits.items()),
         "",
         "## Files",
         "",
@@ -84,8 +86,8 @@ def data_card(store: Store, splits: dict[str, SplitFigures]) -> str:
         "",
         f"- content digest of the store: `{store.digest()}`",
         f"- plans: {', '.join(plan.key for plan in store.plans())}; seed {setting.seed}",
-        f"- begun: {store.document.created}",
-        f"- software: {', '.join(f'{name} {version}' for name, version in sorted(software.items()))}",
+        f"- begun: {markdown(store.document.created)}",
+        f"- software: {_listed(software)}",
         "",
         "## Licence",
         "",
@@ -96,9 +98,13 @@ def data_card(store: Store, splits: dict[str, SplitFigures]) -> str:
     return "\n".join(lines)
 
 
+def _listed(values: Mapping[str, object]) -> str:
+    return ", ".join(f"{markdown(name)} {markdown(value)}" for name, value in sorted(values.items()))
+
+
 def _category_line(category: str, splits: dict[str, SplitFigures]) -> str:
     cells = (f"{f.labels.get(category, 0)} | {_rate(f, category)}" for f in splits.values())
-    return f"| {category} | {' | '.join(cells)} |"
+    return f"| {markdown(category)} | {' | '.join(cells)} |"
 
 
 def _rate(figures: SplitFigures, category: str | None) -> str:

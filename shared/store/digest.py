@@ -6,11 +6,12 @@ Same plan, same seed, same policy: same digest, whether one worker made the roll
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 
-from shared.records import RolloutRecord
+from shared.records import RolloutRecord, RolloutStatus
 from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, Column, InteractionRow, RolloutRow
 from shared.store.observations import ARRAYS
 
@@ -20,6 +21,9 @@ Row = TypeVar("Row")
 def rollout_digest(rollout: RolloutRecord) -> str:
     """SHA-256 of one rollout, over the canonical little-endian bytes of its columns and clouds."""
     digest = hashlib.sha256()
+    if rollout.status is RolloutStatus.NEVER_AT_REST:
+        # Earlier software did not tell the two apart; the same plan shall have the digest that it had.
+        rollout = replace(rollout, status=RolloutStatus.NOTHING_TO_ACT_ON)
     _add_columns(digest, ROLLOUT_COLUMNS, [RolloutRow(rollout, 0)])
     rows = [InteractionRow(rollout, interaction, 0) for interaction in rollout.interactions]
     _add_columns(digest, INTERACTION_COLUMNS, rows)

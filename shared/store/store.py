@@ -185,6 +185,10 @@ class Store:
         """
         return reader.committed_jobs(self.place, plan_key)
 
+    def manifest(self, job: Job) -> ShardManifest:
+        """The manifest of a job's committed shard; raises as `committed` does."""
+        return reader.read_manifest(reader.shard_folder(self.place, job.shard_id))
+
     def parts(self, plan_key: str | None = None) -> list[Part]:
         """What counts of which shard, in order; raises as `committed` does."""
         parts = parts_of(reader.read_manifests(reader.committed_shards(self.place, plan_key)))
