@@ -2,7 +2,8 @@
 
 SAPIEN's native library names `libX11.so.6` as a library that it needs, although it calls nothing of it here, where no
 window is opened. Servers and slim images do not have that library. An empty one of the same name, made in memory, is
-enough for the dynamic linker as long as missing functions are looked up when they are called and not before.
+enough for the dynamic linker as long as missing functions are looked up when they are called and not before. A process
+that calls one, as SAPIEN's renderer does, is ended by the linker; so the renderer asks `is_installed` first.
 """
 
 import ctypes
@@ -12,6 +13,7 @@ import struct
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 NAME = "libX11.so.6"
 
@@ -20,14 +22,20 @@ _HEADERS = 64 + 2 * 56
 _X86_64 = 62
 
 
-@contextmanager
-def without_x11() -> Iterator[None]:
-    """Import a library that names X11 inside this context; does nothing where X11 is installed."""
+@cache
+def is_installed() -> bool:
+    """Whether this machine has the library itself; to be asked before SAPIEN is imported for the first time."""
     try:
         ctypes.CDLL(NAME)
     except OSError:
-        pass
-    else:
+        return False
+    return True
+
+
+@contextmanager
+def without_x11() -> Iterator[None]:
+    """Import a library that names X11 inside this context; does nothing where X11 is installed."""
+    if is_installed():
         yield
         return
     if sys.platform == "linux" and platform.machine() == "x86_64":

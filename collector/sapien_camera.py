@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 
+from collector import libx11
 from collector.articulation import ArticulatedObject, Body
 from collector.camera import FAR, NEAR, DepthImage
 from collector.engine import pose, sapien
@@ -21,6 +22,8 @@ HOW_TO_GET_ONE = (
 @cache
 def why_unavailable() -> str:
     """Why SAPIEN cannot render on this machine, in one line; "" where it can."""
+    if not libx11.is_installed():
+        return "no library libX11.so.6, which SAPIEN's renderer calls; on Debian, libx11-6"
     try:
         sapien.render.RenderSystem()
     except RuntimeError as error:

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from shared.errors import UsageError
 
 EXTRAS: Mapping[str, tuple[str, ...]] = {
-    "collect": ("sapien", "embreex", "coacd", "defusedxml", "trimesh", "ray"),
+    "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
     "report": ("matplotlib", "plotly", "jinja2"),
 }
 """Extras of pyproject.toml, and the packages that each brings."""

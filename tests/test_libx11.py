@@ -65,3 +65,14 @@ print(sum("libX11" in line for line in open("/proc/self/maps")))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_renderer_that_calls_x11_is_refused_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    from collector import sapien_camera
+
+    monkeypatch.setattr(libx11, "is_installed", lambda: False)
+    sapien_camera.why_unavailable.cache_clear()
+    try:
+        assert sapien_camera.why_unavailable().endswith("on Debian, libx11-6")
+    finally:
+        sapien_camera.why_unavailable.cache_clear()
