@@ -14,9 +14,10 @@ from cluster.progress import CollectionProgress, Tally
 from cluster.status import DriverStatus, State, StatusKeeper
 from shared.errors import WorkerError
 from shared.files import process_name
-from shared.plan import Plan, covered, missing_ranges
+from shared.plan import Plan, covered, missing_ranges, parse_plan_key
 from shared.reproduction import reproduction
 from shared.store import Store
+from shared.store.provenance import difference_of_software
 
 OpenFleet = Callable[[], Fleet]
 
@@ -75,6 +76,8 @@ def collect(
     """
     # Only one driver works on a store, so whatever the dead left is of no use to anybody.
     store.sweep()
+    if differing := difference_of_software(store.document.software):
+        logger.warning("%s was begun with other software: %s; results may differ a little", store.where, differing)
     if isinstance(plan, Plan):
         store.add_plan(plan)
     held = {key: [(job.start, job.stop) for job in store.jobs(key)] for key in _plan_keys(store, plan)}
@@ -105,7 +108,8 @@ def _plan_keys(store: Store, plan: Plan | Newest) -> list[str]:
     """The plan, or all of a proposer with any policy."""
     if isinstance(plan, Plan):
         return [plan.key]
-    return [known.key for known in store.plans() if known.proposer == plan.proposer]
+    # By the names of shards: a plan whose file was lost has made its rollouts all the same.
+    return sorted({job.plan_key for job in store.jobs() if parse_plan_key(job.plan_key)[0] == plan.proposer})
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +161,7 @@ class _Standing:
 
 def _report_quarantined(store: Store, plan: Plan | Newest) -> None:
     """Say which rollouts were given up, why, and how to see it happen."""
-    shards = (shard for key in _plan_keys(store, plan) for shard in store.committed(key))
+    shards = (shard for key in _plan_keys(store, plan) for shard in store.manifests(key))
     given_up = [each for shard in shards for each in shard.quarantined]
     logger.warning("%d rollouts of %s are quarantined; `adaafford store info` lists them", len(given_up), plan.key)
     for each in given_up[:MOST_REPORTED]:

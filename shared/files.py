@@ -20,12 +20,13 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-from shared.errors import StoreError, UsageError
+from shared.errors import MissingError, StoreError, UnreadableError, UsageError
 
 TEMPORARY_PREFIX = ".tmp-"
 _PROCESS_NAME = re.compile(r"(?P<space>[^~/]*)~(?P<pid>\d{1,10})~(?P<start>\d{1,20})")
 _TEMPORARY_NAME = re.compile(r"\.tmp-[^~]*~(?P<process>[^~]*~\d+~\d+)~[0-9a-f]+")
 _LOCK_POLL_S = 0.01
+DAY_S = 24 * 3600.0
 
 
 def write_durably(path: Path, data: bytes) -> None:
@@ -107,18 +108,26 @@ def read_bounded(path: Path, limit: int) -> bytes:
     """The bytes of a regular file of at most `limit` bytes.
 
     Raises:
-        StoreError: it is missing, no regular file (a link or a pipe, say), or larger.
+        MissingError: there is no such file.
+        StoreError: it is no regular file (a link or a pipe, say), or larger.
+        UnreadableError: the system refuses to read it.
     """
     try:
         # A pipe in place of a file would block for ever, and a link could lead anywhere.
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
-            regular = stat.S_ISREG(os.fstat(descriptor).st_mode)
-            data = _read_all(descriptor, limit + 1) if regular else b""
+            found = os.fstat(descriptor)
+            regular = stat.S_ISREG(found.st_mode)
+            # No larger pieces than the file needs: as much memory is taken as is asked for.
+            data = _read_all(descriptor, limit + 1, min(found.st_size + 1, 1 << 24)) if regular else b""
         finally:
             os.close(descriptor)
+    except (FileNotFoundError, NotADirectoryError):
+        raise MissingError(f"{path}: cannot be read (it is missing); restore the file from a copy") from None
     except OSError as error:
-        raise StoreError(f"{path}: cannot be read ({error.strerror}); restore the file from a copy") from None
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            raise StoreError(f"{path}: cannot be read ({error.strerror}); restore the file from a copy") from None
+        raise unreadable(path, error) from None
     if not regular:
         raise StoreError(f"{path}: not a regular file; restore it from a copy")
     if len(data) > limit:
@@ -126,9 +135,19 @@ def read_bounded(path: Path, limit: int) -> bytes:
     return data
 
 
-def _read_all(descriptor: int, limit: int) -> bytes:
+def unreadable(path: Path, error: OSError) -> UnreadableError:
+    """What to say when the system refuses to read a file or a folder."""
+    advice = (
+        "ask its owner for read permission"
+        if isinstance(error, PermissionError)
+        else "check the disk or the network, then repeat the command"
+    )
+    return UnreadableError(f"{path}: cannot be read ({error.strerror or error}); {advice}")
+
+
+def _read_all(descriptor: int, limit: int, most: int) -> bytes:
     pieces = []
-    while limit > 0 and (piece := os.read(descriptor, min(limit, 1 << 24))):
+    while limit > 0 and (piece := os.read(descriptor, min(limit, most))):
         pieces.append(piece)
         limit -= len(piece)
     return b"".join(pieces)
@@ -151,7 +170,7 @@ def exclusive_lock(path: Path, wait_seconds: float = 0.0) -> Iterator[None]:
     Raises:
         UsageError: another process holds it; the message names that process.
     """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         _acquire(descriptor, path, time.monotonic() + wait_seconds)
         os.ftruncate(descriptor, 0)
@@ -183,12 +202,19 @@ def host_name() -> str:
 
 @cache
 def _process_space() -> str:
-    """What process ids are unique within: the host, and the namespace, since containers may share a host's name."""
+    """What process ids are unique within: the host, its boot, and the namespace.
+
+    Machines may share a host's name, all of them number their first namespace alike, and containers share a boot.
+    """
     try:
         namespace = re.sub(r"\D", "", Path("/proc/self/ns/pid").readlink().name)
     except OSError:
         namespace = "0"
-    return f"{host_name()}-{namespace}"
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").replace("-", "")[:12]
+    except OSError:
+        boot = "0"
+    return f"{host_name()}-{namespace}-{boot}"
 
 
 def process_name() -> str:
@@ -220,16 +246,28 @@ def temporary_name(name: str) -> str:
 def remove_if_abandoned(path: Path) -> bool:
     """Remove a temporary file or folder whose writer is dead; leave one that is, or may be, still written.
 
-    A writer on another host or in another container may be alive, so its remnants stay.
+    A writer on another host, in another container or from before a restart of the machine may be alive, so what it
+    left stays for a day.
 
     Returns:
         Whether it was removed.
     """
     match = _TEMPORARY_NAME.fullmatch(path.name)
-    if match is None or not is_gone(match["process"]):
+    if match is None or not is_abandoned(path, match["process"], DAY_S):
         return False
     remove_tree(path)
     return True
+
+
+def is_abandoned(path: Path, process: str, after_s: float) -> bool:
+    """Whether the process that made a file has ended, or may only be judged by the file, which is older than that."""
+    match = _PROCESS_NAME.fullmatch(process)
+    if match is None or match["space"] == _process_space():
+        return is_gone(process)
+    try:
+        return time.time() - path.lstat().st_mtime > after_s
+    except OSError:
+        return False
 
 
 def remove_tree(path: Path) -> None:

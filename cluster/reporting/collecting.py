@@ -33,7 +33,7 @@ def collection_section(summary: Summary, store: Store, ledger: Ledger) -> Sectio
     Raises:
         StoreError: a manifest is damaged or foreign.
     """
-    quarantined = [each for manifest in store.committed() for each in manifest.quarantined]
+    quarantined = [each for manifest in store.manifests() for each in manifest.quarantined]
     objects = summary["objects"]
     speed = summary["interactions_per_core_second"]
     lead = (

@@ -5,6 +5,7 @@ from shared.store.export import Export, export
 from shared.store.info import StoreInfo, Tally, info
 from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
 from shared.store.merging import Merged, merge
+from shared.store.migration import Migrated, migrate
 from shared.store.observations import ObservationArrays
 from shared.store.repair import Repair, repair
 from shared.store.store import Store
@@ -16,6 +17,7 @@ __all__ = [
     "Export",
     "FileEntry",
     "Merged",
+    "Migrated",
     "ObservationArrays",
     "Problem",
     "Quarantined",
@@ -28,6 +30,7 @@ __all__ = [
     "export",
     "info",
     "merge",
+    "migrate",
     "repair",
     "verify",
 ]

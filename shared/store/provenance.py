@@ -3,12 +3,17 @@
 import os
 import platform
 import re
+from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 
 from shared.files import host_name
+from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, fingerprint
 
+SCHEMA = "schema"
+"""Name of the fingerprint of the columns, beside the packages."""
+_COMMIT = "git_commit"
 _PACKAGES = ("adaafford", "numpy", "pyarrow", "zarr", "torch", "sapien", "ray", "embreex")
 
 
@@ -22,7 +27,22 @@ def software_versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     commit = _git_commit(Path(__file__).resolve().parents[2])
-    return versions | ({"git_commit": commit} if commit else {})
+    return versions | ({_COMMIT: commit} if commit else {})
+
+
+@cache
+def store_software() -> dict[str, str]:
+    """The same, and a fingerprint of the columns that this software knows, for documents of a store."""
+    return software_versions() | {SCHEMA: fingerprint(ROLLOUT_COLUMNS, INTERACTION_COLUMNS)}
+
+
+def difference_of_software(before: Mapping[str, str]) -> str:
+    """In which packages this software differs from one that a store names, in one line; "" for none."""
+    now = store_software()
+    # The commit changes with every checkout, and what it changes shows in the rest or in the data's digest.
+    names = [name for name in sorted(before.keys() | now.keys()) if name != _COMMIT]
+    differing = [name for name in names if before.get(name) != now.get(name) and (name != SCHEMA or name in before)]
+    return ", ".join(f"{name} {before.get(name, 'none')} before, {now.get(name, 'none')} now" for name in differing)
 
 
 def process_provenance() -> dict[str, str]:
