@@ -99,8 +99,7 @@ def _fits(group: Sequence[ShardManifest], most: int) -> bool:
     last, new = group[-2:]
     clouds = sum(manifest.observations for manifest in group)
     return (
-        (last.plan_key, last.stop, last.points, last.model_extra)
-        == (new.plan_key, new.start, new.points, new.model_extra)
+        (last.plan_key, last.stop, last.points, last.more) == (new.plan_key, new.start, new.points, new.more)
         and new.stop - group[0].start <= most
         and clouds * new.points <= MAX_ALL_POINTS
         and max(clouds, sum(manifest.interactions for manifest in group)) <= MAX_ROWS
@@ -123,7 +122,7 @@ def _merge(store: Store, group: Sequence[ShardManifest]) -> ShardManifest:
         vetted=True,
         unknown=Unknown(
             {file: joined([table[file] for table in tables], job.shard_id) for file in tables[0]},
-            group[0].model_extra or {},
+            group[0].more,
         ),
     )
     if whole.digests != tuple(digest for manifest in group for digest in manifest.digests):

@@ -146,7 +146,7 @@ class DiskPlace:
         with ExitStack() as held:
             try:
                 held.enter_context(exclusive_lock(self.root / f"{LOCK_PREFIX}{name}"))
-            except OSError as error:
+            except PermissionError as error:
                 raise UsageError(
                     f"{self.root}: cannot be worked on ({error.strerror}); it needs write permission for you: have its "
                     f"owner run `chmod -R g+rwX {self.root}`, and all of its users `umask 002`"

@@ -97,7 +97,7 @@ def export(
             if progress is not None:
                 progress(done, len(parts))
         figures = {name: writer.finish() for name, writer in writers.items()}
-        (temporary / "setting.json").write_text(json.dumps(store.setting.model_dump(mode="json"), indent=2) + "\n")
+        (temporary / "setting.json").write_text(json.dumps(store.setting.as_document(), indent=2) + "\n")
         (temporary / "README.md").write_text(data_card(store, figures), encoding="utf-8")
         temporary.rename(out)
     except OSError as error:

@@ -62,7 +62,7 @@ def info(store: Store) -> StoreInfo:
         shards += 1
         rollouts += manifest.rollouts
         observations += manifest.observations
-        size += manifest.bytes + len(seal(manifest.model_dump(mode="json")))
+        size += manifest.bytes + len(seal(manifest.as_document()))
         quarantined += manifest.quarantined
         for row in table.to_pylist():
             outcomes[row["outcome"]] += 1

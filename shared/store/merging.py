@@ -44,7 +44,7 @@ def merge(
         raise UsageError(f"{out}: is one of the stores to merge; name another with --out")
     for source in sources[1:]:
         if source.setting != sources[0].setting:
-            ours, theirs = (s.setting.model_dump(mode="json") for s in (sources[0], source))
+            ours, theirs = (s.setting.as_document() for s in (sources[0], source))
             raise StoreError(
                 f"{source.where}: of another setting than {sources[0].where}: {difference_of(ours, theirs)}"
             )
@@ -55,7 +55,7 @@ def merge(
         # The file of a plan was lost; its name and the setting tell all of it.
         proposer, version = parse_plan_key(key)
         plans[key] = Plan(setting=sources[0].setting, proposer=proposer, policy_version=version)
-    store = Store.create(out, sources[0].setting, sources[0].document.model_extra)
+    store = Store.create(out, sources[0].setting, sources[0].document.more)
     holders = {each.job: each.source for each in reversed(held)}
     with alone(store.place):
         for plan in plans.values():
@@ -131,6 +131,6 @@ def _copy(store: Store, source: Store, part: Part) -> None:
         vetted=True,
         unknown=Unknown(
             {file: part.of(table) for file, table in reader.unknown_of(shard, manifest).items()},
-            manifest.model_extra or {},
+            manifest.more,
         ),
     )

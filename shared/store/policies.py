@@ -52,7 +52,7 @@ def publish_policy(place: Place, version: int, files: Mapping[str, bytes]) -> No
 
 
 def _index(version: int, files: Mapping[str, bytes]) -> bytes:
-    return seal(PolicyIndex(version=version, files=_entries(files)).model_dump(mode="json"))
+    return seal(PolicyIndex(version=version, files=_entries(files)).as_document())
 
 
 def _entries(files: Mapping[str, bytes]) -> dict[str, FileEntry]:

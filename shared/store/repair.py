@@ -136,7 +136,7 @@ def _restore_description(place: Place, setting: Setting, moved: list[str]) -> li
         set_aside(place, STORE_FILE)
     created = datetime.now(UTC).isoformat(timespec="seconds")
     document = StoreDocument(setting=setting, software=store_software(), created=created)
-    place.create(STORE_FILE, seal(document.model_dump(mode="json")))
+    place.create(STORE_FILE, seal(document.as_document()))
     return [STORE_FILE]
 
 

@@ -95,13 +95,14 @@ class Store:
             if not place.exists(STORE_FILE):
                 _refuse_foreign(place)
                 created = datetime.now(UTC).isoformat(timespec="seconds")
-                document = StoreDocument(setting=setting, software=store_software(), created=created, **(more or {}))
-                place.create(STORE_FILE, seal(document.model_dump(mode="json")))
+                known = {"setting": setting, "software": store_software(), "created": created}
+                document = StoreDocument.model_validate(dict(more or {}) | known, extra="allow")
+                place.create(STORE_FILE, seal(document.as_document()))
         except OSError as error:
             raise StoreError(f"{where}: no store can be made here ({error.strerror}); name another folder") from None
         store = cls.open(where)
         if store.setting != setting:
-            difference = difference_of(store.setting.model_dump(mode="json"), setting.model_dump(mode="json"))
+            difference = difference_of(store.setting.as_document(), setting.as_document())
             raise StoreError(f"{where} holds another setting: {difference}; give the same, or another folder")
         return store
 
@@ -138,10 +139,10 @@ class Store:
         if self._recorded.get(plan.key) == plan:
             return
         if plan.setting != self.setting:
-            difference = difference_of(self.setting.model_dump(mode="json"), plan.setting.model_dump(mode="json"))
+            difference = difference_of(self.setting.as_document(), plan.setting.as_document())
             raise StoreError(f"{self.where}: plan {plan.key} is of another setting: {difference}")
         key = f"{PLANS_FOLDER}/{plan.key}.json"
-        made = self.place.create(key, seal(plan.model_dump(mode="json")))
+        made = self.place.create(key, seal(plan.as_document()))
         # Compared as plans: a setting that came with later software has its default in a file that lacks it.
         if not made and self.read_plan(f"{plan.key}.json") != plan:
             raise StoreError(f"{self.where}/{key}: holds another plan of this name; give this one another store")

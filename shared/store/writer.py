@@ -91,7 +91,7 @@ def commit_shard(
         provenance=process_provenance() | {name: str(value) for name, value in provenance.items()},
         quarantined=tuple(quarantined),
     )
-    described = manifest.model_dump(mode="json") | dict(unknown.fields)
+    described = manifest.as_document() | dict(unknown.fields)
     _publish(place, parse_manifest(seal(described), str(shard)), files, vetted=vetted)
     return read_manifest(shard)
 
@@ -141,7 +141,7 @@ def _publish(place: Place, manifest: ShardManifest, files: Mapping[str, bytes], 
         if held != files:
             described = manifest.model_copy(update={"files": _entries(held)})
             _check_taken_over(shard, described)
-        return seal(described.model_dump(mode="json"))
+        return seal(described.as_document())
 
     place.publish(Publication(shard.key, files, MANIFEST_FILE, describe, admit, lock=manifest.plan_key))
 
