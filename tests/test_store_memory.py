@@ -40,11 +40,12 @@ def test_memory_hardly_grows_with_the_number_of_shards(
     # As many manifests are in memory at once as a bucket gives at once; fewer here, so that a small store shows it.
     monkeypatch.setattr(reader, "_BATCH", AT_ONCE)
     peaks = []
-    # The first store warms up whatever is kept for good.
-    for k, shards in enumerate((FEW, FEW, MANY)):
+    # The first store warms up whatever is kept for good; of the large ones, one may meet the moment at which Python
+    # makes its table of texts larger.
+    for k, shards in enumerate((FEW, FEW, MANY, MANY)):
         store = fabricate_store(tmp_path / f"store-{k}", shards)
         tracemalloc.start()
         COMMANDS[name](store, tmp_path / f"out-{k}")
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert (peaks[2] - peaks[1]) / (MANY - FEW) < MOST_BYTES
+    assert (min(peaks[2:]) - peaks[1]) / (MANY - FEW) < MOST_BYTES
