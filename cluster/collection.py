@@ -15,7 +15,7 @@ from cluster.progress import CollectionProgress, Tally, describe_empty
 from cluster.status import DriverStatus, State, StatusKeeper
 from shared.errors import WorkerError
 from shared.files import process_name
-from shared.plan import Plan, covered, missing_ranges
+from shared.plan import Plan, covered, missing_ranges, parse_plan_key
 from shared.reproduction import reproduction
 from shared.store import Store, reopen_quarantined
 from shared.store.info import quarantined_in
@@ -122,7 +122,8 @@ def _plan_keys(store: Store, plan: Plan | Newest) -> list[str]:
     """The plan, or all of a proposer with any policy."""
     if isinstance(plan, Plan):
         return [plan.key]
-    return [known.key for known in store.plans() if known.proposer == plan.proposer]
+    # By the names of shards: a plan whose file was lost has made its rollouts all the same.
+    return sorted({job.plan_key for job in store.jobs() if parse_plan_key(job.plan_key)[0] == plan.proposer})
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +190,7 @@ def _require_interactions(store: Store, plan: Plan | Newest) -> None:
 
 def _report_quarantined(store: Store, plan: Plan | Newest, objects: Path) -> None:
     """Say which rollouts were given up, why, and how to see it happen."""
-    shards = (shard for key in _plan_keys(store, plan) for shard in store.committed(key))
+    shards = (shard for key in _plan_keys(store, plan) for shard in store.manifests(key))
     given_up = quarantined_in(shards, store.where, objects)
     logger.warning("%d rollouts of %s are quarantined; `adaafford store info` lists them", len(given_up), plan.key)
     for each in given_up[:MOST_REPORTED]:

@@ -150,7 +150,7 @@ Adaptive Affordance Prediction and Adaptive Interaction Proposal (Wang et al., E
 def _data(source: Source) -> str:
     setting = source.store.setting
     categories = Counter(ref.category for ref in source.seen)
-    rows = source.store.interactions(["success"]).to_pydict()["success"] if source.store.committed() else []
+    rows = source.store.interactions(["success"]).to_pydict()["success"] if source.store.jobs() else []
     rate = f"{100 * sum(rows) / len(rows):.1f}% successful" if rows else "none"
     return f"""## Data
 

@@ -12,6 +12,7 @@ a thread of C that writes the tracebacks of a hang and then ends the process.
 
 import faulthandler
 import resource
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -72,7 +73,7 @@ class Guard:
         """Gives what to call before each rollout of a job; the last breadcrumb stays, as it is overwritten anyway."""
 
         def under_way(rollout: int | None) -> None:
-            self._underway.leave(Crumb(shard_id=job.shard_id, rollout=rollout))
+            self._underway.leave(Crumb(shard_id=job.shard_id, rollout=rollout, written=time.time()))
             faulthandler.dump_traceback_later(self._limits.rollout_s, exit=True, file=self._log)
 
         try:

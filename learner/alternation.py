@@ -21,6 +21,7 @@ from learner.recipes import ORACLE_FILE
 from learner.stages import DONE_FILE, MAX_DONE_BYTES, Memory, StageJob, StageName, run_stage
 from shared.errors import StoreError, UsageError
 from shared.files import read_bounded, write_atomically
+from shared.plan import parse_plan_key
 from shared.policy import Policy
 from shared.store.store import Store
 
@@ -137,7 +138,8 @@ def converged(scores: list[float], config: AlternationConfig, at_least: int) -> 
 
 def newest_policy(store: Store) -> int:
     """The newest version of a policy that proposed rows of a store; 0 where all are random."""
-    return max((plan.policy_version for plan in store.plans()), default=0)
+    # By the names of shards, which say it also where the file of a plan was lost.
+    return max((parse_plan_key(job.plan_key)[1] for job in store.jobs()), default=0)
 
 
 @dataclass(frozen=True, slots=True)

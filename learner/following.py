@@ -26,6 +26,7 @@ from shared.files import read_bounded, write_atomically
 from shared.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
 from shared.store.layout import MAX_DOCUMENT_BYTES, SHARDS_FOLDER, STORE_FILE, parse_shard_id
 from shared.store.place import place_of
+from shared.store.policies import version_of
 from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
@@ -141,19 +142,31 @@ def publish(store: Store, out: Path, name: str, policy: Path) -> int | None:
         policy: folder of the stage that made it.
 
     Raises:
-        StoreError: another learner took that version at this very moment, or the record is damaged.
+        StoreError: the record is damaged, or a version's files are other than those that were noted.
     """
     if sharing.rank() > 0:
         return None
     versions, taken = _published(out), store.policy_versions()
     files = {file: read_bounded(policy / file, MAX_WEIGHTS_BYTES) for file in (WEIGHTS_FILE, POLICY_FILE)}
     noted = versions.get(name)
-    if noted is None or (noted in taken and store.read_policy(noted) != files):
-        # Noted first: after a kill the same policy goes to the same version, where it may lie already, unless another
-        # learner has taken that one since.
-        versions[name] = max(taken, default=0) + 1
+    if noted is None:
+        # The record may be lost, or the same learner be started twice: then the policy is there already.
+        noted = version_of(store.place, files, besides=versions.values())
+    elif noted in taken and store.read_policy(noted) != files:
+        # Another learner took the version after it was noted and before this process was killed.
+        noted = None
+    while True:
+        # Noted first: after a kill the same policy goes to the same version, where it may lie already.
+        versions[name] = noted if noted is not None else max(store.policy_versions(), default=0) + 1
         write_atomically(out / PUBLISHED_FILE, json.dumps(versions, indent=1).encode())
-    store.publish_policy(versions[name], files)
+        try:
+            store.publish_policy(versions[name], files)
+            break
+        except StoreError:
+            if versions[name] not in store.policy_versions():
+                raise
+            # Another learner took that version at this very moment: the next one, then.
+            noted = None
     print(f"{store.where}: policy {versions[name]} is {policy}", flush=True)
     return versions[name]
 

@@ -20,6 +20,27 @@ class StrictModel(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    def as_document(self) -> dict[str, Any]:
+        """As JSON, together with what newer software wrote into the document that this was read from."""
+        named = {name: _as_document(getattr(self, name)) for name in type(self).model_fields}
+        return self.model_dump(mode="json") | {n: value for n, value in named.items() if value is not None} | self.more
+
+    @property
+    def more(self) -> dict[str, Any]:
+        """What newer software wrote; nothing of a model that was not read from a document of a store."""
+        return dict(self.model_extra or {})
+
+
+def _as_document(value: Any) -> Any:
+    """The document of a value that holds models; None for others."""
+    if isinstance(value, StrictModel):
+        return value.as_document()
+    if isinstance(value, tuple) and value and isinstance(value[0], StrictModel):
+        return [one.as_document() for one in value]
+    if isinstance(value, dict) and value and isinstance(next(iter(value.values())), StrictModel):
+        return {name: one.as_document() for name, one in value.items()}
+    return None
+
 
 class Range(StrictModel):
     """An interval to draw from."""

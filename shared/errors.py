@@ -22,6 +22,18 @@ class StoreError(AdaAffordError, ValueError):
     """A store, shard or policy is damaged, foreign, of another schema, or holds other data."""
 
 
+class MissingError(StoreError):
+    """A file that should be there is not."""
+
+
+class UnreadableError(StoreError):
+    """A disk, a network or a server refused to read something; this says nothing about what is stored there."""
+
+
+class SchemaVersionError(StoreError):
+    """A store, or a document of one, was written under another schema version; it is not damaged."""
+
+
 class WorkerError(AdaAffordError, RuntimeError):
     """A worker failed for reasons of infrastructure; never a statement about an interaction."""
 

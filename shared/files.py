@@ -24,14 +24,12 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-from shared.errors import StoreError, UsageError
+from shared.errors import MissingError, StoreError, UnreadableError, UsageError
 
 TEMPORARY_PREFIX = ".tmp-"
 _PROCESS_NAME = re.compile(r"(?P<space>[^~/]*)~(?P<pid>\d{1,10})~(?P<start>\d{1,20})")
 _TEMPORARY_NAME = re.compile(r"\.tmp-[^~]*~(?P<process>[^~]*~\d+~\d+)~[0-9a-f]+")
 _LOCK_POLL_S = 0.01
-_FOREIGN_S = 86400.0
-"""What a process of another machine or boot left counts as abandoned after so long; nothing is written for a day."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _NOT_SUPPORTED = frozenset({errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL})
 """How file systems refuse what they cannot do."""
@@ -43,6 +41,8 @@ _MOST_HOLDER = 400
 _CREATE_LOCK, _CREATE_WAIT_S = f"{TEMPORARY_PREFIX}create.lock", 60.0
 
 logger = logging.getLogger(__name__)
+DAY_S = 24 * 3600.0
+"""What a process of another machine or boot left counts as abandoned after so long; nothing is written for a day."""
 
 
 def write_durably(path: Path, data: bytes) -> None:
@@ -142,18 +142,26 @@ def read_bounded(path: Path, limit: int) -> bytes:
     """The bytes of a regular file of at most `limit` bytes.
 
     Raises:
-        StoreError: it is missing, no regular file (a link or a pipe, say), or larger.
+        MissingError: there is no such file.
+        StoreError: it is no regular file (a link or a pipe, say), or larger.
+        UnreadableError: the system refuses to read it.
     """
     try:
         # A pipe in place of a file would block for ever, and a link could lead anywhere.
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
-            regular = stat.S_ISREG(os.fstat(descriptor).st_mode)
-            data = _read_all(descriptor, limit + 1) if regular else b""
+            found = os.fstat(descriptor)
+            regular = stat.S_ISREG(found.st_mode)
+            # No larger pieces than the file needs: as much memory is taken as is asked for.
+            data = _read_all(descriptor, limit + 1, min(found.st_size + 1, 1 << 24)) if regular else b""
         finally:
             os.close(descriptor)
+    except (FileNotFoundError, NotADirectoryError):
+        raise MissingError(f"{path}: cannot be read (it is missing); restore the file from a copy") from None
     except OSError as error:
-        raise StoreError(f"{path}: cannot be read ({error.strerror}); restore the file from a copy") from None
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            raise StoreError(f"{path}: cannot be read ({error.strerror}); restore the file from a copy") from None
+        raise unreadable(path, error) from None
     if not regular:
         raise StoreError(f"{path}: not a regular file; restore it from a copy")
     if len(data) > limit:
@@ -161,9 +169,19 @@ def read_bounded(path: Path, limit: int) -> bytes:
     return data
 
 
-def _read_all(descriptor: int, limit: int) -> bytes:
+def unreadable(path: Path, error: OSError) -> UnreadableError:
+    """What to say when the system refuses to read a file or a folder."""
+    advice = (
+        "ask its owner for read permission"
+        if isinstance(error, PermissionError)
+        else "check the disk or the network, then repeat the command"
+    )
+    return UnreadableError(f"{path}: cannot be read ({error.strerror or error}); {advice}")
+
+
+def _read_all(descriptor: int, limit: int, most: int) -> bytes:
     pieces = []
-    while limit > 0 and (piece := os.read(descriptor, min(limit, 1 << 24))):
+    while limit > 0 and (piece := os.read(descriptor, min(limit, most))):
         pieces.append(piece)
         limit -= len(piece)
     return b"".join(pieces)
@@ -192,7 +210,7 @@ def exclusive_lock(path: Path, wait_seconds: float = 0.0) -> Iterator[None]:
     """
     deadline = time.monotonic() + wait_seconds
     note = path.with_name(f"{path.name}{_NOTE_SUFFIX}")
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         if _acquire(descriptor, path, deadline):
             os.ftruncate(descriptor, 0)
@@ -238,7 +256,7 @@ def _write_note(note: Path, deadline: float) -> str:
     own = f"{_holder()}\n{secrets.token_hex(8)}"
     while True:
         try:
-            descriptor = os.open(note, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+            descriptor = os.open(note, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
         except FileExistsError:
             _wait_for_note(note, deadline)
             continue
@@ -266,9 +284,9 @@ def _remove_note(note: Path, held: str) -> None:
     """Remove what a dead process left; of several that would do so, one does, and none removes another's new file."""
     guard = note.with_name(f"{note.name}.clearing")
     try:
-        os.close(os.open(guard, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644))
+        os.close(os.open(guard, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     except FileExistsError:
-        if time.time() - guard.lstat().st_mtime > _FOREIGN_S:
+        if time.time() - guard.lstat().st_mtime > DAY_S:
             raise UsageError(f"{guard}: left by a process that was killed; remove it and try again") from None
         return
     try:
@@ -359,22 +377,6 @@ def end_if_here(process: str) -> None:
         os.kill(int(match["pid"]), signal.SIGKILL)
 
 
-def is_abandoned(process: str, path: Path) -> bool:
-    """Whether nobody will go on with a file or folder that a process left, as far as that can be told from here.
-
-    Args:
-        process: its `process_name`.
-        path: what it left; of a process on another machine, or before this one's last start, its age decides.
-    """
-    match = _PROCESS_NAME.fullmatch(process)
-    if match is None or match["space"] == _process_space():
-        return is_gone(process)
-    try:
-        return time.time() - path.lstat().st_mtime > _FOREIGN_S
-    except OSError:
-        return False
-
-
 def temporary_name(name: str) -> str:
     """A unique name for a temporary file or folder that will become `name`, and that says who made it."""
     return f"{TEMPORARY_PREFIX}{name}~{process_name()}~{secrets.token_hex(6)}"
@@ -389,10 +391,21 @@ def remove_if_abandoned(path: Path) -> bool:
         Whether it was removed.
     """
     match = _TEMPORARY_NAME.fullmatch(path.name)
-    if match is None or not is_abandoned(match["process"], path):
+    if match is None or not is_abandoned(path, match["process"], DAY_S):
         return False
     remove_tree(path)
     return True
+
+
+def is_abandoned(path: Path, process: str, after_s: float) -> bool:
+    """Whether the process that made a file has ended, or may only be judged by the file, which is older than that."""
+    match = _PROCESS_NAME.fullmatch(process)
+    if match is None or match["space"] == _process_space():
+        return is_gone(process)
+    try:
+        return time.time() - path.lstat().st_mtime > after_s
+    except OSError:
+        return False
 
 
 def remove_tree(path: Path) -> None:

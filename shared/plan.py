@@ -22,6 +22,17 @@ class ObjectRef(StrictModel):
     category: str
     content_hash: str = Field(pattern=r"^[0-9a-f]{64}$")
 
+    @property
+    def identity(self) -> tuple[str, str, str]:
+        """What rows name it by, without what newer software may have added."""
+        return self.id, self.category, self.content_hash
+
+
+def parse_plan_key(key: str) -> tuple[str, int]:
+    """Proposer and policy version of a plan, by its key."""
+    proposer, _, version = key.rpartition("-v")
+    return proposer, int(version)
+
 
 ROLLOUTS_PER_SHARD = 8
 """Unless told otherwise: some seconds' work, which is what a kill can cost, of which the commit takes a few percent."""
@@ -47,6 +58,11 @@ class Setting(StrictModel):
     objects: tuple[ObjectRef, ...] = Field(min_length=1)
     collection: CollectionConfig
     evaluation: EvaluationConfig | None = None
+
+    @property
+    def identities(self) -> frozenset[tuple[str, str, str]]:
+        """Of all objects."""
+        return frozenset(ref.identity for ref in self.objects)
 
     @property
     def terms(self) -> Terms:

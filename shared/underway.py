@@ -24,7 +24,7 @@ from pydantic import Field, ValidationError
 
 from shared.configuration import StrictModel
 from shared.errors import StoreError
-from shared.files import is_abandoned, is_gone, process_name, read_bounded
+from shared.files import DAY_S, is_abandoned, is_gone, process_name, read_bounded
 from shared.private import private_folder
 
 if TYPE_CHECKING:
@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 
 UNDERWAY_FOLDER = "underway"
 
+_ABANDONED_S = 30 * DAY_S
+"""A worker of another machine may wait for its next job for days, while a policy is trained."""
+_WORKER_SILENT_S = 600.0
+"""A worker says before each rollout what it does; hardly any takes longer."""
 _CRUMB, _FAULT = ".json", ".fault"
 _CRUMB_BYTES = 256
 _MAX_BYTES = 1 << 16
@@ -48,6 +52,8 @@ class Crumb(StrictModel):
     """Of the job."""
     rollout: int | None = Field(ge=0)
     """The one under way; None while the shard is written, and after that until the next job."""
+    written: float = Field(0.0, ge=0)
+    """Seconds since 1970."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +132,7 @@ class Underway:
     def sweep(self) -> int:
         """Remove what ended processes left, as far as that can be told; returns how many files that was."""
         crumbs = [process for process in self.crumbs() if is_gone(process)] if self.url else []
-        files = [file for file in self._files() if is_abandoned(file.stem, file)]
+        files = [file for file in self._files() if is_abandoned(file, file.stem, _ABANDONED_S)]
         for process in crumbs:
             _place(self.url).remove(_key(process))
         for file in files:
@@ -160,6 +166,17 @@ class Underway:
             return read_bounded(self._file(process, suffix), _MAX_BYTES)
         except StoreError:
             return b""
+
+
+def workers_at_work(url: str, now: float) -> list[str]:
+    """Processes that leave breadcrumbs in a bucket and have not ended, as far as that can be told from here.
+
+    Args:
+        url: of the store.
+        now: seconds since 1970.
+    """
+    crumbs = Underway(Path(), url).crumbs()
+    return [name for name, crumb in crumbs.items() if not is_gone(name) and now - crumb.written < _WORKER_SILENT_S]
 
 
 @cache

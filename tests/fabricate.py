@@ -7,7 +7,9 @@ rollout = fabricate_rollout(plan, index=5, interactions=32)
 
 import dataclasses
 import hashlib
+import shutil
 import struct
+from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +18,11 @@ from shared.geometry import camera_pose, gripper_rotation
 from shared.observation import round_normals, round_points
 from shared.plan import Job, ObjectRef, Plan, Setting
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
+from shared.store import Store
+from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, InteractionRow, RolloutRow
+from shared.store.digest import rollout_digest
+from shared.store.sealed import seal
+from shared.store.tables import table_bytes
 from shared.vocabulary import (
     Action,
     Direction,
@@ -163,3 +170,40 @@ def identical(one: object, other: object) -> bool:
     if isinstance(one, float):
         return struct.pack("<d", one) == struct.pack("<d", other)
     return one == other
+
+
+def fabricate_store(path: Path, shards: int, rollouts: int = 2, points: int = 64) -> Store:
+    """A store of many small shards that verifies; they share the files of their clouds, and none is synchronised."""
+    setting = fabricate_setting(points=points)
+    plan, store = Plan(setting=setting), Store.create(path, setting)
+    first = store.commit(plan, Job(plan.key, 0, rollouts), fabricate_rollouts(plan, Job(plan.key, 0, rollouts), 1), {})
+    clouds = {name: (store.shards_folder / first.shard_id / name) for name in first.files if "/" in name}
+    made = store.read_rollouts(first.shard_id)
+    content = first.model_dump(mode="json")
+    for number in range(1, shards):
+        job = Job(plan.key, number * rollouts, (number + 1) * rollouts)
+        folder = store.shards_folder / job.shard_id
+        records = [dataclasses.replace(one, index=job.start + k) for k, one in enumerate(made)]
+        heads = [RolloutRow(one, k) for k, one in enumerate(records)]
+        rows = [InteractionRow(one, one.interactions[0], k) for k, one in enumerate(records)]
+        tables = {"rollouts.parquet": table_bytes(ROLLOUT_COLUMNS, heads)}
+        tables["interactions.parquet"] = table_bytes(INTERACTION_COLUMNS, rows)
+        for parent in sorted({str((folder / name).parent) for name in clouds}):
+            Path(parent).mkdir(parents=True, exist_ok=True)
+        for name, source in clouds.items():
+            # A file system allows only so many links of a file.
+            if number % 30_000 == 0:
+                clouds[name] = shutil.copy(source, folder / name)
+            else:
+                (folder / name).hardlink_to(source)
+        for name, data in tables.items():
+            (folder / name).write_bytes(data)
+        entries = {n: {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()} for n, data in tables.items()}
+        described = content | {
+            "start": job.start,
+            "stop": job.stop,
+            "files": content["files"] | entries,
+            "digests": [rollout_digest(one) for one in records],
+        }
+        (folder / "manifest.json").write_bytes(seal(described))
+    return store

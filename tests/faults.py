@@ -1,18 +1,20 @@
-"""Faults at every write step of a store: what fails, when, and how many steps there are.
+"""Faults at every write or read step of a store: what fails, when, and how many steps there are.
 
 with disk_faults(Fault("ENOSPC", step=7)) as steps: ...    # raises from the seventh step; len(steps) counts them
+with disk_read_faults(Fault("EIO", step=7), folder) as steps: ...    # likewise for reading, below a folder
 """
 
 import errno
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
-from obstore.exceptions import GenericError
+from obstore.exceptions import GenericError, PermissionDeniedError
 
 from shared.store.bucket import BucketPlace
 
@@ -21,6 +23,10 @@ BUCKET_CALLS = ("put", "copy", "delete")
 DISK_FAULTS = ("ENOSPC", "EIO", "late EIO", "short write", "short write, then ENOSPC")
 BUCKET_FAULTS = ("refused", "answer lost")
 KILLS = ("kill before", "kill after")
+DISK_READ_CALLS = ("open", "read", "listdir", "stat")
+BUCKET_READ_CALLS = ("get", "head", "list", "list_with_delimiter")
+DISK_READ_FAULTS = ("EIO", "ESTALE", "EACCES", "vanished")
+BUCKET_READ_FAULTS = ("refused", "forbidden", "timed out")
 
 
 @dataclass(slots=True)
@@ -37,14 +43,14 @@ class Fault:
         """Do one step, or let it fail."""
         with self.lock:
             self.steps.append(name)
-            hit = len(self.steps) == self.step
+            hit = len(self.steps) == self.step or (self.kind == "vanished" and 0 < self.step <= len(self.steps))
             after_short = self.kind.endswith("then ENOSPC") and len(self.steps) == self.step + 1
         if after_short and name == "write":
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         if not hit:
             return real(*args, **kwargs)
         match self.kind:
-            case "ENOSPC" | "EIO":
+            case "ENOSPC" | "EIO" | "ESTALE" | "EACCES":
                 code = getattr(errno, self.kind)
                 raise OSError(code, os.strerror(code))
             case "late EIO":
@@ -55,6 +61,12 @@ class Fault:
             case "short write" | "short write, then ENOSPC" if name == "write":
                 descriptor, data = args
                 return real(descriptor, data[: max(1, len(data) // 2)])
+            case "vanished":
+                raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
+            case "forbidden":
+                raise PermissionDeniedError("403 Forbidden")
+            case "timed out":
+                raise GenericError("operation timed out")
             case "refused":
                 raise GenericError("503 Slow Down")
             case "answer lost":
@@ -92,26 +104,66 @@ def disk_faults(fault: Fault) -> Iterator[list[str]]:
             setattr(os, name, function)
 
 
+@contextmanager
+def disk_read_faults(fault: Fault, folder: str) -> Iterator[list[str]]:
+    """Let a step of reading below a folder fail."""
+    real = {name: getattr(os, name) for name in DISK_READ_CALLS}
+    descriptors = set()
+
+    def call(name: str, *args: Any, **kwargs: Any) -> Any:
+        mine = args[0] in descriptors if name == "read" else str(args[0]).startswith(folder)
+        if not mine or (name == "open" and args[1] & os.O_CREAT):
+            return real[name](*args, **kwargs)
+        done = fault.call(name, real[name], *args, **kwargs)
+        if name == "open":
+            descriptors.add(done)
+        return done
+
+    try:
+        for name in DISK_READ_CALLS:
+            setattr(os, name, partial(call, name))
+        yield fault.steps
+    finally:
+        for name, function in real.items():
+            setattr(os, name, function)
+
+
 class _FaultyClient:
-    """An obstore client whose writes fail."""
+    """An obstore client some of whose requests fail."""
+
+    def __init__(self, real: Any, fault: Fault, calls: Collection[str]) -> None:
+        self._real, self._fault, self._calls = real, fault, calls
+
+    def __getattr__(self, name: str) -> Any:
+        real = getattr(self._real, name)
+        if name not in self._calls:
+            return real
+        if name == "list":
+            # Nothing is asked for before the first page is.
+            return lambda *args, **kwargs: _FaultyPages(real(*args, **kwargs), self._fault)
+        return lambda *args, **kwargs: self._fault.call(name, real, *args, **kwargs)
+
+
+class _FaultyPages:
+    """Pages of a listing, of which one fails."""
 
     def __init__(self, real: Any, fault: Fault) -> None:
         self._real, self._fault = real, fault
 
-    def __getattr__(self, name: str) -> Any:
-        real = getattr(self._real, name)
-        if name not in BUCKET_CALLS:
-            return real
-        return lambda *args, **kwargs: self._fault.call(name, real, *args, **kwargs)
+    def __iter__(self) -> "_FaultyPages":
+        return self
+
+    def __next__(self) -> Any:
+        return self._fault.call("list", next, self._real)
 
 
 @contextmanager
-def bucket_faults(fault: Fault) -> Iterator[list[str]]:
-    """Let a step of writing to a bucket fail, in places that are opened within the context."""
+def bucket_faults(fault: Fault, calls: Collection[str] = BUCKET_CALLS) -> Iterator[list[str]]:
+    """Let a step of writing to a bucket fail, or of other calls, in places that are opened within the context."""
     init = BucketPlace.__init__
 
     def faulty(self: BucketPlace, where: str, client: Any) -> None:
-        init(self, where, _FaultyClient(client, fault))
+        init(self, where, _FaultyClient(client, fault, calls))
 
     try:
         BucketPlace.__init__ = faulty  # type: ignore[method-assign]

@@ -198,4 +198,4 @@ def test_a_plan_is_not_confused_with_another(tmp_path: Path) -> None:
     commit(store, 0, 2)
     snapshot = Snapshot.of(store.parts())
     commit(store, 0, 2, version=1)
-    assert {part.manifest.plan_key for part in store.as_of(snapshot).parts()} == {Plan(setting=PLAN.setting).key}
+    assert {part.shard.plan_key for part in store.as_of(snapshot).parts()} == {Plan(setting=PLAN.setting).key}

@@ -231,7 +231,6 @@ def test_paths_of_a_manifest_are_never_followed(store: Store, shard: Path, name:
         {"plan_key": "../../x-v1"},
         {"observations": 2**16, "points": 2**14},
         {"observations": 2**11, "points": 2**14},
-        {"surprise": 1},
     ],
 )
 def test_absurd_manifests_are_refused(store: Store, shard: Path, changes: dict[str, Any]) -> None:

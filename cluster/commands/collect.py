@@ -138,7 +138,10 @@ def _collect(command: CollectCommand) -> None:
     else:
         plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
     limits = Limits(chosen.rollout_limit_s, chosen.memory_limit_mb)
-    with store.only_driver(), fleets(chosen.workers, limits, chosen.ray_address) as make_fleet:
+    with (
+        store.only_driver(alone=command.policy == "latest"),
+        fleets(chosen.workers, limits, chosen.ray_address) as make_fleet,
+    ):
         open_fleet = partial(make_fleet, partial(make_worker, where, folder), store.underway)
         collect(
             store,

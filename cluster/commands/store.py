@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from shared.records import RolloutRecord
     from shared.store import Store
 
-ACTIONS = ("info", "verify", "digest", "replay", "repair", "compact", "merge", "export")
+ACTIONS = ("info", "verify", "digest", "replay", "repair", "compact", "merge", "export", "migrate")
 MOST_QUARANTINED = 20
 """Quarantined rollouts that `info` lists as text; `--json` lists all."""
 MOST_SHOWN = 20
@@ -85,7 +85,7 @@ def main(args: list[str]) -> int:
             return _info(parse_flags(InfoCommand, args[1:], "store info"))
         case ["verify"]:
             return _verify(parse_flags(VerifyCommand, args[1:], "store verify"))
-        case ["repair" | "compact" | "merge" | "export"]:
+        case ["repair" | "compact" | "merge" | "export" | "migrate"]:
             from cluster.commands import upkeep
 
             return upkeep.main(args)
@@ -160,7 +160,7 @@ def _verify(command: VerifyCommand) -> int:
         return 1 if problems else 0
     for problem in problems:
         print(plain(f"{problem.where}: {problem.what}"))
-    print(f"{len(problems)} problems" if problems else f"no problems in {len(store.committed())} shards")
+    print(f"{len(problems)} problems" if problems else f"no problems in {len(store.jobs())} shards")
     if divergence is not None:
         _print_divergence(divergence)
     return 1 if problems else 0

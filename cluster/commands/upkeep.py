@@ -1,4 +1,4 @@
-"""`adaafford store repair|compact|merge|export`: what makes stores out of stores."""
+"""`adaafford store repair|compact|merge|export|migrate`: what makes stores out of stores."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from cluster.settings import parse_flags
-from shared.errors import UsageError
+from shared.errors import StoreError, UsageError
 from shared.plain import plain
 
 MOST_SHOWN = 20
@@ -69,8 +69,34 @@ class ExportCommand:
     """Print one JSON object instead of text."""
 
 
+@dataclass(frozen=True, slots=True)
+class MigrateCommand:
+    """Write a store of an older schema version anew under the current one. The same command again goes on."""
+
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the old store, which stays as it is."""
+    out: str
+    """Folder or s3:// URL of the new store."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
 def main(args: list[str]) -> int:
-    """Dispatch; `args` begin with the action."""
+    """Dispatch; `args` begin with the action.
+
+    Raises:
+        StoreError: the disk refuses something; nothing is lost by that, and the same command goes on.
+    """
+    try:
+        return _dispatch(args)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        raise StoreError(
+            f"{where}cannot be written ({error.strerror or error}); check space and permissions, then repeat it"
+        ) from None
+
+
+def _dispatch(args: list[str]) -> int:
     match args[0]:
         case "repair":
             return _repair(parse_flags(RepairCommand, args[1:], "store repair"))
@@ -80,7 +106,28 @@ def main(args: list[str]) -> int:
             return _merge(parse_flags(MergeCommand, args[1:], "store merge"))
         case "export":
             return _export(parse_flags(ExportCommand, args[1:], "store export"))
+        case "migrate":
+            return _migrate(parse_flags(MigrateCommand, args[1:], "store migrate"))
     raise UsageError(f"no action '{args[0]}'")
+
+
+def _refuse_while_collecting(where: str) -> None:
+    """Refuse a store whose last driver says that it is at work; another machine's lock may not be seen from here.
+
+    Raises:
+        UsageError: it does.
+    """
+    import time
+
+    from cluster.status import SILENT_S, read_status
+    from shared.store.place import place_of
+
+    status = read_status(place_of(where))
+    if status is not None and status.is_alive(time.time()):
+        raise UsageError(
+            f"{where} is in use by process {status.process}, which collects {status.title}; wait for it or stop it "
+            f"(one that was killed is forgotten after {SILENT_S:.0f} s)"
+        )
 
 
 def _repair(command: RepairCommand) -> int:
@@ -88,6 +135,7 @@ def _repair(command: RepairCommand) -> int:
     from shared.reproduction import reproduction
     from shared.store import repair
 
+    _refuse_while_collecting(command.store)
     with advancing("verifying, shards") as advance:
         store, done = repair(command.store, advance)
     commands = [reproduction(store.where, job.shard_id, "OBJECTS") for job in done.to_collect]
@@ -116,6 +164,7 @@ def _compact(command: CompactCommand) -> int:
     from shared.store import Store, compact
 
     store = Store.open(command.store)
+    _refuse_while_collecting(command.store)
     with advancing("compacting, shards") as advance:
         done = compact(store, command.rollouts, advance)
     if command.json:
@@ -131,6 +180,7 @@ def _merge(command: MergeCommand) -> int:
 
     if not command.stores:
         raise UsageError("store merge needs one store or more, and --out")
+    _refuse_while_collecting(command.out)
     with advancing("merging, shards") as advance:
         store, done = merge([Store.open(where) for where in command.stores], command.out, advance)
     if command.json:
@@ -163,4 +213,18 @@ def _export(command: ExportCommand) -> int:
     for name, figures in done.splits.items():
         print(f"{name:<6} {figures.interactions} interactions of {len(figures.objects)} objects")
     print(f"into {done.out}; its README.md says what they are")
+    return 0
+
+
+def _migrate(command: MigrateCommand) -> int:
+    from cluster.benchmarks.progress import advancing
+    from shared.store import migrate
+
+    with advancing("migrating, shards") as advance:
+        done = migrate(command.store, command.out, advance)
+    if command.json:
+        print(json.dumps(asdict(done), indent=2))
+        return 0
+    print(f"{done.shards} shards of schema version {done.version} written anew, digest {done.digest}")
+    print(f"into {command.out}; {command.store} stays as it is")
     return 0

@@ -34,7 +34,7 @@ def collection_section(summary: Summary, store: Store, ledger: Ledger) -> Sectio
     Raises:
         StoreError: a manifest is damaged or foreign.
     """
-    quarantined = quarantined_in(store.committed())
+    quarantined = quarantined_in(store.manifests())
     objects = summary["objects"]
     speed = summary["interactions_per_core_second"]
     lead = (

@@ -5,6 +5,7 @@ from shared.store.export import Export, export
 from shared.store.info import StoreInfo, Tally, info
 from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
 from shared.store.merging import Merged, merge
+from shared.store.migration import Migrated, migrate
 from shared.store.observations import ObservationArrays
 from shared.store.reopening import reopen_quarantined
 from shared.store.repair import Repair, repair
@@ -17,6 +18,7 @@ __all__ = [
     "Export",
     "FileEntry",
     "Merged",
+    "Migrated",
     "ObservationArrays",
     "Problem",
     "Quarantined",
@@ -29,6 +31,7 @@ __all__ = [
     "export",
     "info",
     "merge",
+    "migrate",
     "reopen_quarantined",
     "repair",
     "verify",

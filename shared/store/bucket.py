@@ -10,16 +10,17 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from datetime import timedelta
 from typing import Any, TypeVar
 
 from obstore.exceptions import AlreadyExistsError, BaseError, GenericError, PreconditionError
 from obstore.store import S3Store
 
-from shared.errors import StoreError, UsageError
+from shared.errors import MissingError, StoreError, UnreadableError, UsageError
 from shared.redaction import without_secrets
 from shared.store.place import URL_SCHEME, Publication
+from shared.store.presence import Presence
 
 AT_ONCE = 16
 """Requests under way at the same time; each waits for the network most of its time."""
@@ -183,10 +184,9 @@ class BucketPlace:
         """See `Place.sweep`; here unfinished folders stay, for whoever finishes them."""
         return 0
 
-    @contextmanager
-    def only_one(self, name: str) -> Iterator[None]:
-        """See `Place.only_one`; several holders do no harm here, they only do the same work twice."""
-        yield
+    def only_one(self, name: str, *, alone: bool = False) -> AbstractContextManager[Any]:
+        """See `Place.only_one`; several drivers do no harm here, they only do the same work twice."""
+        return Presence(self, name, alone=alone)
 
     def _map(self, act: Callable[[Any], Answer], items: Sequence[Any]) -> Iterator[Answer]:
         if self._pool is None:
@@ -201,19 +201,19 @@ class BucketPlace:
             return request()
         except (FileNotFoundError, GenericError) as error:
             if "NoSuchBucket" in str(error):
-                raise StoreError(f"{self.where}: there is no such bucket; make it, or name another") from None
+                raise UnreadableError(f"{self.where}: there is no such bucket; make it, or name another") from None
             if not isinstance(error, FileNotFoundError):
                 raise self._out_of_reach(key, error) from None
             if not missing_is_error:
                 raise
-            raise StoreError(f"{self._at(key)}: there is no such object; restore it from a copy") from None
+            raise MissingError(f"{self._at(key)}: there is no such object; restore it from a copy") from None
         except (AlreadyExistsError, PreconditionError):
             raise
         except (BaseError, OSError) as error:
             raise self._out_of_reach(key, error) from None
 
-    def _out_of_reach(self, key: str, error: Exception) -> StoreError:
-        return StoreError(f"{self._at(key)}: {_line(error)}; check the network and the AWS_* variables")
+    def _out_of_reach(self, key: str, error: Exception) -> UnreadableError:
+        return UnreadableError(f"{self._at(key)}: {_line(error)}; check the network and the AWS_* variables")
 
     def _at(self, key: str) -> str:
         return f"{self.where}/{key}" if key else self.where

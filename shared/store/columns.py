@@ -1,5 +1,6 @@
 """The columns of the two tables: one list that the writer, the reader, the digest and the schema all follow."""
 
+import hashlib
 import json
 import operator
 from collections.abc import Callable, Sequence
@@ -54,6 +55,8 @@ class Column(Generic[Row]):
         description: for the schema.
         value: the cell of a row.
         content: whether it enters the content digest; what depends on the shard, on time or on other columns does not.
+        default: of a column that came after others, what rows hold that were written before; None for the first ones.
+            Such a column is no content, since older software could not compute the digest (docs/compatibility.md).
     """
 
     name: str
@@ -62,6 +65,11 @@ class Column(Generic[Row]):
     description: str
     value: Callable[[Row], Any]
     content: bool = True
+    default: Any = None
+
+    def __post_init__(self) -> None:
+        """Hold a column that was added to what older software can verify."""
+        assert self.default is None or not self.content, f"{self.name} has a default, so it must be no content"
 
     @property
     def arrow_type(self) -> Any:
@@ -209,6 +217,12 @@ def _of_rollout(column: Column[RolloutRow]) -> Column[InteractionRow]:
         lambda row: column.value(RolloutRow(row.rollout, row.first_observation)),
         content=False,
     )
+
+
+def fingerprint(*tables: Sequence[Column[Any]]) -> str:
+    """A short text that changes with any column of some tables: what a store's software knows of its rows."""
+    known = [[(c.name, c.dtype, c.width, c.content) for c in columns] for columns in tables]
+    return hashlib.sha256(json.dumps(known).encode()).hexdigest()[:16]
 
 
 ROLLOUT_COLUMNS = _rollout_columns()

@@ -35,9 +35,11 @@ def rollout_digest(rollout: RolloutRecord) -> str:
 
 
 def combined_digest(digests: Iterable[tuple[str, int, str]]) -> str:
-    """SHA-256 of many rollouts, given as plan key, number within the plan and digest, in any order."""
-    lines = (f"{plan_key} {index} {digest}\n" for plan_key, index, digest in sorted(digests))
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    """SHA-256 of many rollouts, given as plan key, number within the plan and digest, in this order."""
+    digest = hashlib.sha256()
+    for plan_key, index, one in digests:
+        digest.update(f"{plan_key} {index} {one}\n".encode())
+    return digest.hexdigest()
 
 
 def _add_columns(digest: Any, columns: Sequence[Column[Row]], rows: Sequence[Row]) -> None:

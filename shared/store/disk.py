@@ -1,11 +1,13 @@
 """A store in a folder of a disk: written beside, forced to the disk, renamed into place."""
 
+import errno
 import os
+import stat
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path, PurePosixPath
 
-from shared.errors import StoreError
+from shared.errors import StoreError, UsageError
 from shared.files import (
     TEMPORARY_PREFIX,
     create_exclusively,
@@ -15,6 +17,7 @@ from shared.files import (
     remove_tree,
     sync_folder,
     temporary_name,
+    unreadable,
     write_atomically,
     write_durably,
 )
@@ -36,14 +39,14 @@ class DiskPlace:
 
     def is_there(self) -> bool:
         """See `Place.is_there`."""
-        return self.root.is_dir()
+        return stat.S_ISDIR(_mode(self.root))
 
     def read(self, key: str, limit: int) -> bytes:
         """See `Place.read`; what is reached through a symbolic link below the first level is refused."""
         parts = PurePosixPath(key).parts
         for depth in range(2, len(parts)):
             # A link could lead anywhere. The first level may be one: a disk of its own for the shards, say.
-            if self.root.joinpath(*parts[:depth]).is_symlink():
+            if stat.S_ISLNK(_mode(self.root.joinpath(*parts[:depth]), follow=False)):
                 raise StoreError(f"{self._at(key)}: reached through a symbolic link; replace it by the folder itself")
         return read_bounded(self._at(key), limit)
 
@@ -53,7 +56,7 @@ class DiskPlace:
 
     def exists(self, key: str) -> bool:
         """See `Place.exists`."""
-        return self._at(key).exists()
+        return _mode(self._at(key)) != 0
 
     def exist(self, keys: Sequence[str]) -> Iterator[bool]:
         """See `Place.exist`."""
@@ -62,7 +65,12 @@ class DiskPlace:
     def names(self, folder: str) -> list[str]:
         """See `Place.names`."""
         path = self._at(folder)
-        return sorted(os.listdir(path)) if path.is_dir() else []  # noqa: PTH208 - twice as fast, and there may be millions.
+        if not stat.S_ISDIR(_mode(path)):
+            return []
+        try:
+            return sorted(os.listdir(path))  # noqa: PTH208 - twice as fast, and there may be millions.
+        except OSError as error:
+            raise unreadable(path, error) from None
 
     def names_from(self, folder: str, first: str) -> Iterator[str]:
         """See `Place.names_from`; a disk has no order of names, so all are listed."""
@@ -70,16 +78,22 @@ class DiskPlace:
 
     def leaves(self, folder: str) -> list[str]:
         """See `Place.leaves`."""
-        entries = [(p, p.is_dir() and not p.is_symlink()) for p in self._at(folder).rglob("*")]
-        full = {path.parent for path, _ in entries}
-        return sorted(
-            path.relative_to(self.root).as_posix() for path, is_dir in entries if not is_dir or path not in full
-        )
+        found = []
+        left = [folder] if stat.S_ISDIR(_mode(self._at(folder))) else []
+        while left:
+            inner = left.pop()
+            names = self.names(inner)
+            if not names and inner != folder:
+                found.append(inner)
+            for name in names:
+                key = f"{inner}/{name}"
+                (left if stat.S_ISDIR(_mode(self._at(key), follow=False)) else found).append(key)
+        return sorted(found)
 
     def create(self, key: str, data: bytes) -> bool:
         """See `Place.create`."""
         path = self._at(key)
-        if path.exists():
+        if _mode(path):
             return False
         path.parent.mkdir(parents=True, exist_ok=True)
         return create_exclusively(path, data)
@@ -109,7 +123,7 @@ class DiskPlace:
     def move(self, key: str, new: str) -> None:
         """See `Place.move`."""
         old, target = self._at(key), self._at(new)
-        if not old.exists() and not old.is_symlink():
+        if not _mode(old, follow=False):
             return
         target.parent.mkdir(parents=True, exist_ok=True)
         old.rename(target)
@@ -127,9 +141,16 @@ class DiskPlace:
         return sum(map(remove_if_abandoned, remnants))
 
     @contextmanager
-    def only_one(self, name: str) -> Iterator[None]:
+    def only_one(self, name: str, *, alone: bool = False) -> Iterator[None]:
         """See `Place.only_one`."""
-        with exclusive_lock(self.root / f"{LOCK_PREFIX}{name}"):
+        with ExitStack() as held:
+            try:
+                held.enter_context(exclusive_lock(self.root / f"{LOCK_PREFIX}{name}"))
+            except PermissionError as error:
+                raise UsageError(
+                    f"{self.root}: cannot be worked on ({error.strerror}); it needs write permission for you: have its "
+                    f"owner run `chmod -R g+rwX {self.root}`, and all of its users `umask 002`"
+                ) from None
             yield
 
     def _at(self, key: str) -> Path:
@@ -140,10 +161,10 @@ class DiskPlace:
         folder = final.parent
         # The lock makes one step of looking at what is there and of renaming; the data were written without it.
         with exclusive_lock(folder / f"{LOCK_PREFIX}{publication.lock}", _LOCK_WAIT_S):
-            if (final / publication.mark).exists():
+            if _mode(final / publication.mark):
                 return False
             publication.admit()
-            if final.exists():
+            if _mode(final):
                 # A folder of this name without its mark: half a copy, say. Under this name a sweep may remove it.
                 remnant = folder / temporary_name(final.name)
                 final.rename(remnant)
@@ -151,6 +172,22 @@ class DiskPlace:
             temporary.rename(final)
             sync_folder(folder)
         return True
+
+
+def _mode(path: Path, *, follow: bool = True) -> int:
+    """What kind of thing lies at a path; 0 for nothing.
+
+    Raises:
+        UnreadableError: the system does not say.
+    """
+    try:
+        return path.stat(follow_symlinks=follow).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return 0
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            return 0
+        raise unreadable(path, error) from None
 
 
 def _write_files(folder: Path, files: Mapping[str, bytes], mark: str, description: bytes) -> None:

@@ -8,7 +8,7 @@ OUT/
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,12 @@ from shared.errors import StoreError, UsageError
 from shared.files import remove_tree, temporary_name
 from shared.seeds import generator
 from shared.store.columns import INTERACTION_COLUMNS
+from shared.store.coverage import ROLLOUT_COLUMN
 from shared.store.datacard import SplitFigures, data_card
+from shared.store.layout import INTERACTIONS_FILE
 from shared.store.observations import ARRAYS, ObservationArrays
 from shared.store.store import Store
-from shared.store.tables import schema_of
+from shared.store.tables import joined, schema_of, unknown_columns
 
 CLOUDS_A_CHUNK = 64
 
@@ -84,17 +86,18 @@ def export(
     temporary = out.parent / temporary_name(out.name)
     try:
         temporary.mkdir(parents=True)
-        writers = {name: _SplitWriter(temporary / name, store, objects) for name, objects in splits.items()}
         parts = store.parts()
+        unknown = _unknown_fields(store)
+        writers = {name: _SplitWriter(temporary / name, store, objects, unknown) for name, objects in splits.items()}
         for done, part in enumerate(parts, 1):
             tables = store.tables_of(part)
-            clouds = store.read_observations(part.manifest.shard_id)
+            clouds = store.read_observations(part.shard.shard_id)
             for writer in writers.values():
                 writer.add(*tables, clouds)
             if progress is not None:
                 progress(done, len(parts))
         figures = {name: writer.finish() for name, writer in writers.items()}
-        (temporary / "setting.json").write_text(json.dumps(store.setting.model_dump(mode="json"), indent=2) + "\n")
+        (temporary / "setting.json").write_text(json.dumps(store.setting.as_document(), indent=2) + "\n")
         (temporary / "README.md").write_text(data_card(store, figures), encoding="utf-8")
         temporary.rename(out)
     except OSError as error:
@@ -102,6 +105,18 @@ def export(
     finally:
         remove_tree(temporary)
     return Export(str(out), figures)
+
+
+def _unknown_fields(store: Store) -> Any:
+    """Columns that newer software added to any shard; those of a file are fixed once its first row is written."""
+    found: list[Any] = []
+    for _, _, table in store.each(INTERACTIONS_FILE):
+        unknown = unknown_columns(table.slice(0, 0), INTERACTION_COLUMNS, ROLLOUT_COLUMN)
+        if not any(unknown.schema.equals(schema) for schema in found):
+            found.append(unknown.schema)
+    tables = [schema.empty_table() for schema in found]
+    fields = joined(tables, store.where).schema if tables else []
+    return [field for field in fields if field.name != ROLLOUT_COLUMN]
 
 
 def _check_splits(store: Store, splits: Mapping[str, frozenset[str]]) -> None:
@@ -117,12 +132,11 @@ def _check_splits(store: Store, splits: Mapping[str, frozenset[str]]) -> None:
 class _SplitWriter:
     """One split's files, shard by shard, so that memory does not grow with the store."""
 
-    def __init__(self, folder: Path, store: Store, objects: frozenset[str]) -> None:
+    def __init__(self, folder: Path, store: Store, objects: frozenset[str], unknown: Sequence[Any]) -> None:
         folder.mkdir()
         self._name, self._objects = folder.name, pa.array(sorted(objects), pa.string())
-        self._rows = pq.ParquetWriter(
-            folder / "interactions.parquet", schema_of(INTERACTION_COLUMNS), compression="zstd"
-        )
+        self._schema = pa.schema([*schema_of(INTERACTION_COLUMNS), *unknown])
+        self._rows = pq.ParquetWriter(folder / "interactions.parquet", self._schema, compression="zstd")
         self._clouds = zarr.create_group(folder / "observations.zarr", zarr_format=3)
         points = store.setting.collection.camera.points
         for kind in ARRAYS:
@@ -145,7 +159,11 @@ class _SplitWriter:
         places[numbers] = self._written + np.arange(len(numbers), dtype=np.int32)
         column = rows.schema.get_field_index("observation")
         renumbered = pa.array(places[rows.column("observation").to_numpy()], pa.int32())
-        self._rows.write_table(rows.set_column(column, rows.schema.field(column), renumbered))
+        rows = rows.set_column(column, rows.schema.field(column), renumbered)
+        for field in self._schema:
+            if field.name not in rows.column_names:
+                rows = rows.append_column(field, pa.nulls(len(rows), field.type))
+        self._rows.write_table(rows.select(self._schema.names).cast(self._schema))
         self._append(clouds, np.array(numbers, np.int64))
         self._written += len(numbers)
         self._figures = self._figures.with_rows(rollouts, rows, len(numbers))

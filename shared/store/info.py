@@ -1,13 +1,13 @@
 """What a store holds, in figures."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from shared.reproduction import OBJECTS, STORE, reproduction
-from shared.store.layout import MANIFEST_FILE, MAX_DOCUMENT_BYTES, Quarantined, ShardManifest
-from shared.store.reader import shard_folder
+from shared.store.layout import INTERACTIONS_FILE, ROLLOUTS_FILE, Quarantined, ShardManifest
+from shared.store.sealed import seal
 from shared.store.store import Store
 from shared.vocabulary import OutcomeKind
 
@@ -67,31 +67,52 @@ def info(store: Store) -> StoreInfo:
     Raises:
         StoreError: a file is damaged or foreign.
     """
-    manifests = store.committed()
+    shards = rollouts = observations = size = 0
+    quarantined: list[Quarantined] = []
+    categories, proposers, roles = _Tallies(), _Tallies(), _Tallies()
+    outcomes, statuses = Counter[str](), Counter[str]()
     columns = ["object_category", "proposer", "policy_version", "role", "outcome", "success"]
-    table = store.interactions(columns).to_pydict()
-    labels = [OutcomeKind(kind).is_label for kind in table["outcome"]]
-    proposers = [f"{n} v{v}" for n, v in zip(table["proposer"], table["policy_version"], strict=True)]
-
-    def tally(names: Sequence[str]) -> dict[str, Tally]:
-        rows = [(name, ok) for name, ok, label in zip(names, table["success"], labels, strict=True) if label]
-        tried, succeeded = Counter(name for name, _ in rows), Counter(name for name, ok in rows if ok)
-        return {name: Tally(count, succeeded[name]) for name, count in sorted(tried.items())}
-
+    for _, manifest, table in store.each(INTERACTIONS_FILE, columns):
+        shards += 1
+        rollouts += manifest.rollouts
+        observations += manifest.observations
+        size += manifest.bytes + len(seal(manifest.as_document()))
+        quarantined += quarantined_in([manifest], store.where)
+        for row in table.to_pylist():
+            outcomes[row["outcome"]] += 1
+            if OutcomeKind(row["outcome"]).is_label:
+                categories.add(row["object_category"], row["success"])
+                proposers.add(f"{row['proposer']} v{row['policy_version']}", row["success"])
+                roles.add(row["role"], row["success"])
+    for _, _, table in store.each(ROLLOUTS_FILE, ["status"]):
+        statuses.update(table.column("status").to_pylist())
     return StoreInfo(
-        shards=len(manifests),
-        rollouts=sum(manifest.rollouts for manifest in manifests),
-        interactions=len(labels),
-        observations=sum(manifest.observations for manifest in manifests),
-        bytes=sum(manifest.bytes + _manifest_bytes(store, manifest) for manifest in manifests),
-        by_category=tally(table["object_category"]),
-        by_proposer=tally(proposers),
-        by_role=tally(table["role"]),
-        by_outcome=dict(sorted(Counter(table["outcome"]).items())),
-        by_status=dict(sorted(Counter(store.rollouts().column("status").to_pylist()).items())),
-        quarantined=quarantined_in(manifests, store.where),
+        shards=shards,
+        rollouts=rollouts,
+        interactions=sum(outcomes.values()),
+        observations=observations,
+        bytes=size,
+        by_category=categories.found,
+        by_proposer=proposers.found,
+        by_role=roles.found,
+        by_outcome=dict(sorted(outcomes.items())),
+        by_status=dict(sorted(statuses.items())),
+        quarantined=tuple(quarantined),
     )
 
 
-def _manifest_bytes(store: Store, manifest: ShardManifest) -> int:
-    return len(shard_folder(store.place, manifest.shard_id).read(MANIFEST_FILE, MAX_DOCUMENT_BYTES))
+class _Tallies:
+    """Interactions and successes by some name."""
+
+    def __init__(self) -> None:
+        self._tried, self._succeeded = Counter[str](), Counter[str]()
+
+    def add(self, name: str, success: bool) -> None:
+        """Count one interaction."""
+        self._tried[name] += 1
+        self._succeeded[name] += success
+
+    @property
+    def found(self) -> dict[str, Tally]:
+        """In order of name."""
+        return {name: Tally(count, self._succeeded[name]) for name, count in sorted(self._tried.items())}

@@ -17,16 +17,18 @@ Names that begin with ".tmp-" are work in progress or its remnants; names that b
 """
 
 import re
-from typing import Any
+import sys
+from typing import TypeVar
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from shared.configuration import StrictModel
-from shared.errors import StoreError
+from shared.errors import SchemaVersionError, StoreError
 from shared.plan import Job, Setting
-from shared.store.sealed import parse_object, unseal
+from shared.store.sealed import is_sealed, parse_object, unseal
 
 SCHEMA_VERSION = 1
+"""What the number promises, and when it grows, is told in docs/compatibility.md."""
 STORE_FILE = "store.json"
 MANIFEST_FILE = "manifest.json"
 INTERACTIONS_FILE = "interactions.parquet"
@@ -105,9 +107,14 @@ class ShardManifest(StrictModel):
         return self
 
     @property
+    def job(self) -> Job:
+        """The rollouts that it holds."""
+        return Job(self.plan_key, self.start, self.stop)
+
+    @property
     def shard_id(self) -> str:
         """Name of the shard's folder."""
-        return Job(self.plan_key, self.start, self.stop).shard_id
+        return self.job.shard_id
 
     @property
     def rollouts(self) -> int:
@@ -130,44 +137,62 @@ class StoreDocument(StrictModel):
     """UTC, ISO 8601."""
 
 
-def parse_manifest(data: bytes, source: str) -> ShardManifest:
-    """A manifest from hostile bytes.
+Document = TypeVar("Document", bound=BaseModel)
+
+
+def parse_document(model: type[Document], data: bytes, source: str, what: str) -> Document:
+    """A sealed document from hostile bytes; fields that this software does not know are kept, wherever they are.
+
+    Args:
+        model: what it must be.
+        data: the file.
+        source: what messages call it.
+        what: what it should be, for messages, such as "a manifest".
 
     Raises:
-        StoreError: damaged, foreign, or of another schema version.
+        SchemaVersionError: it is of another schema version.
+        StoreError: it is damaged or foreign.
     """
-    check_schema_version(parse_object(data, source), source)
+    if "schema_version" in model.model_fields:
+        check_schema_version(data, source)
     try:
-        return ShardManifest.model_validate(unseal(data, source))
+        return model.model_validate(unseal(data, source), extra="allow")
     except ValidationError as error:
-        raise StoreError(f"{source}: not a manifest ({_first(error)})") from None
+        raise StoreError(f"{source}: not {what} ({_first(error)}); the file is damaged or foreign") from None
+
+
+def parse_manifest(data: bytes, source: str) -> ShardManifest:
+    """A manifest from hostile bytes; raises as `parse_document` does."""
+    return parse_document(ShardManifest, data, source, "a manifest")
 
 
 def parse_store_document(data: bytes, source: str) -> StoreDocument:
-    """store.json from hostile bytes.
-
-    Raises:
-        StoreError: damaged, foreign, or of another schema version.
-    """
-    check_schema_version(parse_object(data, source), source)
-    try:
-        return StoreDocument.model_validate(unseal(data, source))
-    except ValidationError as error:
-        raise StoreError(f"{source}: not a store's description ({_first(error)})") from None
+    """store.json from hostile bytes; raises as `parse_document` does."""
+    return parse_document(StoreDocument, data, source, "a store's description")
 
 
-def check_schema_version(content: dict[str, Any], source: str) -> None:
+def check_schema_version(data: bytes, source: str) -> None:
     """Refuse documents of other schema versions.
 
     Raises:
-        StoreError: the version is another, or missing.
+        SchemaVersionError: the version is another.
+        StoreError: it names no version, or was damaged where it names it.
     """
+    content = parse_object(data, source)
     version = content.get("schema_version")
-    if version != SCHEMA_VERSION:
-        raise StoreError(
-            f"{source}: schema version {str(version)[:20]}, but this software reads version {SCHEMA_VERSION}; "
-            "use the software that wrote it"
-        )
+    if version == SCHEMA_VERSION:
+        return
+    # A flipped bit in the number itself is damage: with the right number, the document is what was sealed.
+    if not isinstance(version, int) or is_sealed(content | {"schema_version": SCHEMA_VERSION}):
+        raise StoreError(f"{source}: names no schema version; the file is damaged: restore it from a copy")
+    older = (
+        "run `adaafford store migrate STORE --out NEW`"
+        if version < SCHEMA_VERSION
+        else "use the software that wrote it, or newer"
+    )
+    raise SchemaVersionError(
+        f"{source}: schema version {version}, but this software reads version {SCHEMA_VERSION}; {older}"
+    )
 
 
 def parse_shard_id(name: str) -> Job | None:
@@ -175,7 +200,8 @@ def parse_shard_id(name: str) -> Job | None:
     match = _SHARD_ID.fullmatch(name)
     if match is None:
         return None
-    job = Job(match["plan"], int(match["start"]), int(match["stop"]))
+    # One text for all jobs of a plan, since there may be millions.
+    job = Job(sys.intern(match["plan"]), int(match["start"]), int(match["stop"]))
     return job if job.start < job.stop and job.shard_id == name else None
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from shared.errors import UsageError
 
@@ -58,7 +58,9 @@ class Place(Protocol):
         """A file of at most `limit` bytes.
 
         Raises:
-            StoreError: it is missing, larger, no regular file, or out of reach.
+            MissingError: there is none.
+            StoreError: it is larger, or no regular file.
+            UnreadableError: the disk, the network or the server refuses; so may all that follows here.
         """
         ...
 
@@ -119,8 +121,12 @@ class Place(Protocol):
         """Remove what dead writers left unfinished directly in some folders; returns how many."""
         ...
 
-    def only_one(self, name: str) -> AbstractContextManager[None]:
-        """Hold the place against other holders of the same name, where it has locks.
+    def only_one(self, name: str, *, alone: bool = False) -> AbstractContextManager[Any]:
+        """Hold the place against other holders of the same name.
+
+        Args:
+            name: what is held.
+            alone: whether there must be no other at all; a place without locks takes several holders otherwise.
 
         Raises:
             UsageError: another process holds it; the message names that process.

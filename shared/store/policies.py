@@ -2,15 +2,13 @@
 
 import hashlib
 import re
-from collections.abc import Mapping
-
-from pydantic import ValidationError
+from collections.abc import Collection, Mapping
 
 from shared.configuration import StrictModel
 from shared.errors import StoreError
-from shared.store.layout import MAX_DOCUMENT_BYTES, POLICIES_FOLDER, SCHEMA_VERSION, FileEntry, check_schema_version
+from shared.store.layout import MAX_DOCUMENT_BYTES, POLICIES_FOLDER, SCHEMA_VERSION, FileEntry, parse_document
 from shared.store.place import Folder, Place, Publication
-from shared.store.sealed import parse_object, seal, unseal
+from shared.store.sealed import seal
 
 INDEX_FILE = "index.json"
 MAX_POLICY_BYTES = 1 << 30
@@ -54,8 +52,11 @@ def publish_policy(place: Place, version: int, files: Mapping[str, bytes]) -> No
 
 
 def _index(version: int, files: Mapping[str, bytes]) -> bytes:
-    entries = {n: FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) for n, data in files.items()}
-    return seal(PolicyIndex(version=version, files=entries).model_dump(mode="json"))
+    return seal(PolicyIndex(version=version, files=_entries(files)).as_document())
+
+
+def _entries(files: Mapping[str, bytes]) -> dict[str, FileEntry]:
+    return {n: FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) for n, data in files.items()}
 
 
 def read_policy(place: Place, version: int) -> dict[str, bytes]:
@@ -63,26 +64,44 @@ def read_policy(place: Place, version: int) -> dict[str, bytes]:
 
     Raises:
         StoreError: there is no such policy, or it is damaged.
+        SchemaVersionError: its index is of another schema version.
     """
     folder = _folder(place, version)
-    if not folder.has(INDEX_FILE):
-        known = ", ".join(str(v) for v in policy_versions(place)) or "none"
-        raise StoreError(f"{folder}: there is no policy {version}; published: {known}")
-    path = f"{folder}/{INDEX_FILE}"
-    data = folder.read(INDEX_FILE, MAX_DOCUMENT_BYTES)
-    check_schema_version(parse_object(data, path), path)
-    try:
-        index = PolicyIndex.model_validate(unseal(data, path))
-    except ValidationError:
-        raise StoreError(f"{path}: not the index of a policy; the file is damaged or foreign") from None
-    sizes = sum(entry.size for entry in index.files.values())
-    if index.version != version or not all(map(_allowed, index.files)) or sizes > MAX_POLICY_BYTES:
-        raise StoreError(f"{path}: not the index of policy {version}; the file is foreign")
+    index = _read_index(place, version)
     contents = folder.read_all([(name, entry.size) for name, entry in index.files.items()])
     return {
         name: _checked(f"{folder}/{name}", data, index.files[name])
         for name, data in zip(index.files, contents, strict=True)
     }
+
+
+def version_of(place: Place, files: Mapping[str, bytes], besides: Collection[int] = ()) -> int | None:
+    """The first version that was published with exactly these files; None if there is none.
+
+    Args:
+        place: of the store.
+        files: of the policy.
+        besides: versions that do not count.
+
+    Raises:
+        StoreError: an index is damaged.
+    """
+    entries = _entries(files)
+    alike = (v for v in policy_versions(place) if v not in besides and _read_index(place, v).files == entries)
+    return next(alike, None)
+
+
+def _read_index(place: Place, version: int) -> PolicyIndex:
+    folder = _folder(place, version)
+    if not folder.has(INDEX_FILE):
+        known = ", ".join(str(v) for v in policy_versions(place)) or "none"
+        raise StoreError(f"{folder}: there is no policy {version}; published: {known}")
+    path = f"{folder}/{INDEX_FILE}"
+    index = parse_document(PolicyIndex, folder.read(INDEX_FILE, MAX_DOCUMENT_BYTES), path, "the index of a policy")
+    sizes = sum(entry.size for entry in index.files.values())
+    if index.version != version or not all(map(_allowed, index.files)) or sizes > MAX_POLICY_BYTES:
+        raise StoreError(f"{path}: not the index of policy {version}; the file is foreign")
+    return index
 
 
 def policy_versions(place: Place) -> tuple[int, ...]:

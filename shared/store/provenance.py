@@ -18,9 +18,13 @@ from pathlib import Path
 
 from shared.errors import StoreError
 from shared.files import host_name, machine_name
+from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, fingerprint
 from shared.store.layout import STATUS_FOLDER
 from shared.store.place import Place
 
+SCHEMA = "schema"
+"""Name of the fingerprint of the columns, beside the packages."""
+_COMMIT = "git_commit"
 _PACKAGES = ("adaafford", "numpy", "pyarrow", "zarr", "torch", "sapien", "ray", "embreex")
 
 _MAX_NOTE_BYTES = 1 << 12
@@ -36,7 +40,12 @@ def software_versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     commit = _git_commit(Path(__file__).resolve().parents[2])
-    return versions | ({"git_commit": commit} if commit else {})
+    return versions | ({_COMMIT: commit} if commit else {})
+
+
+def store_software() -> dict[str, str]:
+    """The same, and a fingerprint of the columns that this software knows, for documents of a store."""
+    return software_versions() | {SCHEMA: fingerprint(ROLLOUT_COLUMNS, INTERACTION_COLUMNS)}
 
 
 def process_provenance() -> dict[str, str]:
@@ -64,9 +73,13 @@ def _key(machine: str) -> str:
 
 
 def changed_versions(before: Mapping[str, str], now: Mapping[str, str] | None = None) -> str:
-    """What differs between two sets of versions, such as "numpy 2.1.0 (now 2.2.0)"; "" if nothing does."""
-    now = software_versions() if now is None else now
-    names = [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
+    """What differs between two sets of versions, such as "numpy 2.1.0 (now 2.2.0)"; "" if nothing does.
+
+    The commit is left out: it changes with every checkout, and what it changes shows in the rest or in the digest.
+    """
+    now = store_software() if now is None else now
+    compared = [name for name in sorted(before.keys() | now.keys()) if name != _COMMIT]
+    names = [name for name in compared if before.get(name) != now.get(name) and (name != SCHEMA or name in before)]
     return ", ".join(f"{name} {before.get(name, 'none')[:40]} (now {now.get(name, 'none')[:40]})" for name in names)
 
 

@@ -2,8 +2,9 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -11,7 +12,8 @@ from shared.errors import StoreError
 from shared.plan import Job, ObjectRef
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store import observations
-from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS
+from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, Column
+from shared.store.coverage import ROLLOUT_COLUMN, Part
 from shared.store.layout import (
     INTERACTIONS_FILE,
     MANIFEST_FILE,
@@ -25,7 +27,7 @@ from shared.store.layout import (
 )
 from shared.store.observations import ObservationArrays
 from shared.store.place import Folder, Place
-from shared.store.tables import INTERACTION_SCHEMA, MAX_ROW_BYTES, ROLLOUT_SCHEMA, column_values, read_table
+from shared.store.tables import MAX_ROW_BYTES, column_values, read_table, unknown_columns
 from shared.store.validity import check_quarantined, check_rollouts
 from shared.vocabulary import (
     Action,
@@ -39,6 +41,11 @@ from shared.vocabulary import (
     Role,
 )
 
+Item = TypeVar("Item")
+
+_BATCH = 128
+"""Shards whose manifests or tables are in memory at once."""
+
 
 def shard_folder(place: Place, shard_id: str) -> Folder:
     """Where a shard lies, or would."""
@@ -50,36 +57,34 @@ def is_committed(shard: Folder) -> bool:
     return shard.has(MANIFEST_FILE)
 
 
-def shard_folders(place: Place, plan_key: str | None = None) -> Iterator[Folder]:
-    """Folders that are called as shards are, committed or not, in order of name."""
+def named_jobs(place: Place, plan_key: str | None = None) -> Iterator[Job]:
+    """The jobs that folders are called by, committed or not, in order of name."""
     for name in place.names(SHARDS_FOLDER):
         job = parse_shard_id(name)
         if job is not None and plan_key in (None, job.plan_key):
-            yield shard_folder(place, name)
-
-
-def committed_shards(place: Place, plan_key: str | None = None) -> list[Folder]:
-    """Folders of the committed shards, in order of name."""
-    folders = list(shard_folders(place, plan_key))
-    there = place.exist([f"{folder.key}/{MANIFEST_FILE}" for folder in folders])
-    return [folder for folder, is_there in zip(folders, there, strict=True) if is_there]
+            yield job
 
 
 def committed_jobs(place: Place, plan_key: str | None = None) -> list[Job]:
-    """The jobs whose shards are committed, by the shards' names alone."""
-    return [job for folder in committed_shards(place, plan_key) if (job := parse_shard_id(folder.name)) is not None]
+    """The jobs whose shards are committed, in order of name, by the shards' names alone."""
+    found = []
+    for jobs in _batches(named_jobs(place, plan_key)):
+        there = place.exist([f"{SHARDS_FOLDER}/{job.shard_id}/{MANIFEST_FILE}" for job in jobs])
+        found += [job for job, is_there in zip(jobs, there, strict=True) if is_there]
+    return found
 
 
-def read_manifests(shards: Sequence[Folder]) -> list[ShardManifest]:
-    """The manifests of some committed shards of one place.
+def read_manifests(place: Place, jobs: Iterable[Job]) -> Iterator[ShardManifest]:
+    """The manifests of some committed shards, in their order; a bucket gives several at once.
 
     Raises:
         StoreError: one is damaged, foreign, of another schema version, or another shard's.
     """
-    if not shards:
-        return []
-    contents = shards[0].place.read_all([(f"{shard.key}/{MANIFEST_FILE}", MAX_DOCUMENT_BYTES) for shard in shards])
-    return [checked_manifest(shard, data) for shard, data in zip(shards, contents, strict=True)]
+    for batch in _batches(jobs):
+        shards = [shard_folder(place, job.shard_id) for job in batch]
+        contents = place.read_all([(f"{shard.key}/{MANIFEST_FILE}", MAX_DOCUMENT_BYTES) for shard in shards])
+        for shard, data in zip(shards, contents, strict=True):
+            yield checked_manifest(shard, data)
 
 
 def read_manifest(shard: Folder) -> ShardManifest:
@@ -127,6 +132,11 @@ def read_file(shard: Folder, manifest: ShardManifest, name: str) -> bytes:
     return _checked(shard, manifest, name, shard.read(name, manifest.files[name].size))
 
 
+def read_files(shard: Folder, manifest: ShardManifest) -> dict[str, bytes]:
+    """All files of a shard but its manifest, by path within it; raises as `read_file` does."""
+    return dict(zip(manifest.files, _read_files(shard, manifest, list(manifest.files)), strict=True))
+
+
 def _read_files(shard: Folder, manifest: ShardManifest, names: Sequence[str]) -> Iterator[bytes]:
     contents = shard.read_all([(name, manifest.files[name].size) for name in names])
     return (_checked(shard, manifest, name, data) for name, data in zip(names, contents, strict=True))
@@ -143,36 +153,50 @@ def _checked(shard: Folder, manifest: ShardManifest, name: str, data: bytes) -> 
 
 def read_interactions(shard: Folder, manifest: ShardManifest) -> Any:
     """The table of a shard's interactions."""
-    data = read_file(shard, manifest, INTERACTIONS_FILE)
-    return read_table(data, INTERACTION_SCHEMA, manifest.interactions, f"{shard}/{INTERACTIONS_FILE}")
+    return _table(shard, manifest, INTERACTIONS_FILE, read_file(shard, manifest, INTERACTIONS_FILE))
 
 
 def read_rollout_table(shard: Folder, manifest: ShardManifest) -> Any:
     """The table of a shard's rollouts."""
-    data = read_file(shard, manifest, ROLLOUTS_FILE)
-    return read_table(data, ROLLOUT_SCHEMA, manifest.rollouts, f"{shard}/{ROLLOUTS_FILE}")
+    return _table(shard, manifest, ROLLOUTS_FILE, read_file(shard, manifest, ROLLOUTS_FILE))
 
 
-def read_many_interactions(
-    place: Place, manifests: Sequence[ShardManifest], names: Sequence[Sequence[str]]
-) -> Iterator[Any]:
-    """Some columns of the interactions of many shards, which a bucket gives at once; raises as `read_file` does."""
-    return _read_tables(place, manifests, INTERACTIONS_FILE, INTERACTION_SCHEMA, names)
+def read_tables(
+    place: Place, parts: Iterable[Part], file: str, names: Sequence[str] | None = None
+) -> Iterator[tuple[Part, ShardManifest, Any]]:
+    """One of the two tables of many shards, with the rows that count; a bucket gives several at once.
+
+    Args:
+        place: of the store.
+        parts: what counts of which shard.
+        file: which table.
+        names: read these columns only.
+
+    Raises:
+        StoreError: a file is damaged or foreign.
+    """
+    for batch in _batches(parts):
+        manifests = list(read_manifests(place, [part.shard for part in batch]))
+        shards = [shard_folder(place, manifest.shard_id) for manifest in manifests]
+        wanted = [(f"{shard.key}/{file}", m.files[file].size) for shard, m in zip(shards, manifests, strict=True)]
+        for part, shard, manifest, data in zip(batch, shards, manifests, place.read_all(wanted), strict=True):
+            read = names if names is None or part.is_whole else list(dict.fromkeys([*names, ROLLOUT_COLUMN]))
+            table = part.of(_table(shard, manifest, file, _checked(shard, manifest, file, data), read))
+            yield part, manifest, table if names is None else table.select(list(names))
 
 
-def read_many_rollout_tables(place: Place, manifests: Sequence[ShardManifest]) -> Iterator[Any]:
-    """The rollouts of many shards, likewise."""
-    return _read_tables(place, manifests, ROLLOUTS_FILE, ROLLOUT_SCHEMA, [None] * len(manifests))
+def _table(shard: Folder, manifest: ShardManifest, file: str, data: bytes, names: Sequence[str] | None = None) -> Any:
+    columns: Sequence[Column[Any]] = INTERACTION_COLUMNS if file == INTERACTIONS_FILE else ROLLOUT_COLUMNS
+    rows = manifest.interactions if file == INTERACTIONS_FILE else manifest.rollouts
+    return read_table(data, columns, rows, f"{shard}/{file}", names)
 
 
-def _read_tables(
-    place: Place, manifests: Sequence[ShardManifest], file: str, schema: Any, names: Sequence[Sequence[str] | None]
-) -> Iterator[Any]:
-    shards = [shard_folder(place, manifest.shard_id) for manifest in manifests]
-    wanted = [(f"{shard.key}/{file}", m.files[file].size) for shard, m in zip(shards, manifests, strict=True)]
-    for shard, manifest, columns, data in zip(shards, manifests, names, place.read_all(wanted), strict=True):
-        rows = manifest.interactions if file == INTERACTIONS_FILE else manifest.rollouts
-        yield read_table(_checked(shard, manifest, file, data), schema, rows, f"{shard}/{file}", columns)
+def unknown_of(shard: Folder, manifest: ShardManifest) -> dict[str, Any]:
+    """What the two tables hold that this software does not know, by file; see `tables.unknown_columns`."""
+    return {
+        ROLLOUTS_FILE: unknown_columns(read_rollout_table(shard, manifest), ROLLOUT_COLUMNS, ROLLOUT_COLUMN),
+        INTERACTIONS_FILE: unknown_columns(read_interactions(shard, manifest), INTERACTION_COLUMNS, ROLLOUT_COLUMN),
+    }
 
 
 def read_observations(shard: Folder, manifest: ShardManifest) -> ObservationArrays:
@@ -212,6 +236,13 @@ def read_rollouts(shard: Folder, manifest: ShardManifest) -> tuple[RolloutRecord
     check_rollouts(rollouts, job, manifest.points, str(shard))
     check_quarantined(rollouts, manifest.quarantined, str(shard))
     return tuple(rollouts)
+
+
+def _batches(items: Iterable[Item]) -> Iterator[list[Item]]:
+    """Lists of at most `_BATCH` of some items."""
+    left = iter(items)
+    while batch := list(islice(left, _BATCH)):
+        yield batch
 
 
 def _rows(table: Any, columns: Sequence[Any]) -> list[dict[str, Any]]:

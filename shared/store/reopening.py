@@ -9,10 +9,12 @@ from collections.abc import Iterator, Sequence
 
 from shared.plan import Job
 from shared.records import RolloutStatus
+from shared.store import reader
+from shared.store.coverage import Part
 from shared.store.layout import SHARDS_FOLDER
 from shared.store.repair import set_aside
 from shared.store.store import Store
-from shared.store.writer import commit_shard
+from shared.store.writer import Unknown, commit_shard
 
 
 def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
@@ -27,15 +29,17 @@ def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
     """
     count = 0
     for part in [part for key in plan_keys for part in store.parts(key)]:
-        manifest = part.manifest
+        manifest = store.manifest(part.shard)
         if not manifest.quarantined:
             continue
         rollouts = store.read_rollouts(manifest.shard_id)
+        unknown = reader.unknown_of(reader.shard_folder(store.place, manifest.shard_id), manifest)
         wanted = {rollout.index for rollout in rollouts if rollout.status is RolloutStatus.QUARANTINED}
         kept = [Job(manifest.plan_key, *ends) for ends in _ranges(manifest.start, manifest.stop, wanted)]
         # What a compaction has not set aside yet holds these rollouts as well.
         old = [job for job in store.jobs(manifest.plan_key) if job.start < manifest.stop and manifest.start < job.stop]
         for job in kept:
+            rest = Part(manifest.job, job.start, job.stop)
             commit_shard(
                 store.place,
                 job,
@@ -43,7 +47,8 @@ def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
                 manifest.points,
                 {**manifest.provenance, "split_from": manifest.shard_id},
                 (),
-                supersedes={job.shard_id for job in old},
+                vetted=True,
+                unknown=Unknown({file: rest.of(table) for file, table in unknown.items()}, manifest.more),
             )
         for job in sorted(set(old) - set(kept), key=lambda job: job.stop - job.start):
             set_aside(store.place, f"{SHARDS_FOLDER}/{job.shard_id}")

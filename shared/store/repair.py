@@ -1,18 +1,20 @@
 """Repair: what is broken is set aside, never deleted, and what it held is named, so that it can be collected again.
 
 Whatever can be told from the rest is made anew: a plan from its name and the setting, store.json from any plan.
+
+What cannot be read at this moment, or was written under another schema version, is not broken: it ends the repair.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 
-from pydantic import ValidationError
-
-from shared.errors import StoreError
-from shared.plan import Job, Plan, Setting
+from shared.errors import MissingError, SchemaVersionError, StoreError, UnreadableError
+from shared.plan import Job, Plan, Setting, covered, parse_plan_key
 from shared.store import reader
+from shared.store.coverage import order
 from shared.store.layout import (
     ASIDE_FOLDER,
     MAX_DOCUMENT_BYTES,
@@ -21,13 +23,15 @@ from shared.store.layout import (
     SHARDS_FOLDER,
     STORE_FILE,
     StoreDocument,
+    parse_document,
     parse_shard_id,
     parse_store_document,
 )
 from shared.store.place import Place, place_of
 from shared.store.policies import folder_name
-from shared.store.provenance import software_versions
-from shared.store.sealed import canonical, seal, unseal
+from shared.store.presence import alone
+from shared.store.provenance import store_software
+from shared.store.sealed import canonical, seal
 from shared.store.store import Store
 from shared.store.verify import Problem, lost_policy_key, verify
 
@@ -60,16 +64,20 @@ def repair(where: str | Path, progress: Callable[[int, int], None] | None = None
 
     Raises:
         StoreError: there is no store, or nothing tells what its setting was.
-        UsageError: a driver is at work on it.
+        SchemaVersionError: the store, or a part of it, is of another schema version; nothing was changed.
+        UnreadableError: something cannot be read at this moment; nothing was set aside for that.
+        UsageError: a driver or a worker is at work on it.
     """
     place = place_of(where)
+    if not place.is_there():
+        raise StoreError(f"{where}: there is no such folder; name an existing store")
+    setting = _setting_to_restore(place)
     moved: list[str] = []
-    made = _restore_description(place, moved)
-    store = Store.open(where)
     found: list[Problem] = []
     lost: list[int] = []
-    with store.only_driver():
-        store.sweep()
+    with alone(place):
+        made = [] if setting is None else _restore_description(place, setting, moved)
+        store = Store.open(where)
         for _ in range(_MOST_ROUNDS):
             problems = [*verify(store, progress), *_unfinished(store)]
             if not problems:
@@ -80,6 +88,7 @@ def repair(where: str | Path, progress: Callable[[int, int], None] | None = None
                 moved.append(key)
             made += _make_plans(store)
             lost += _note_lost_policies(store)
+        store.sweep()
         missing = _missing(store, moved)
     return store, Repair(tuple(found), tuple(moved), tuple(made), tuple(lost), tuple(missing))
 
@@ -87,27 +96,47 @@ def repair(where: str | Path, progress: Callable[[int, int], None] | None = None
 def set_aside(place: Place, key: str) -> str:
     """Move a file or folder of a store to a free name below "aside/", which nothing reads."""
     folder, _, name = f"{ASIDE_FOLDER}/{key}".rpartition("/")
-    taken = set(place.names(folder))
-    new = next(free for n in range(len(taken) + 1) if (free := f"{name}.{n}" if n else name) not in taken)
+    names = (f"{name}.{n}" if n else name for n in count())
+    # Not by a list of what is there: a compaction sets a million shards aside.
+    new = next(n for n in names if not place.exists(f"{folder}/{n}") and not place.leaves(f"{folder}/{n}"))
     place.move(key, f"{folder}/{new}")
     return f"{folder}/{new}"
 
 
-def _restore_description(place: Place, moved: list[str]) -> list[str]:
-    """Make store.json anew from a plan where it is missing or broken."""
+def _setting_to_restore(place: Place) -> Setting | None:
+    """What store.json must say where it is missing or broken, told from any plan; None where it is sound.
+
+    Raises:
+        StoreError: no plan tells it, or store.json, or a shard where it is broken, is not damaged but something else.
+    """
     try:
         parse_store_document(place.read(STORE_FILE, MAX_DOCUMENT_BYTES), f"{place.where}/{STORE_FILE}")
-        return []
+    except (UnreadableError, SchemaVersionError):
+        raise
     except StoreError as error:
         setting = _setting_of_any_plan(place)
-        if setting is None:
-            raise error
+        if setting is None or (isinstance(error, MissingError) and place.exists(STORE_FILE)):
+            raise
+        # A lost store.json says nothing of the version; the shards do.
+        for manifest in reader.committed_jobs(place):
+            try:
+                reader.read_manifest(reader.shard_folder(place, manifest.shard_id))
+            except (UnreadableError, SchemaVersionError):
+                raise
+            except StoreError:
+                continue
+        return setting
+    return None
+
+
+def _restore_description(place: Place, setting: Setting, moved: list[str]) -> list[str]:
+    """Make store.json anew."""
     if place.exists(STORE_FILE):
         moved.append(STORE_FILE)
         set_aside(place, STORE_FILE)
     created = datetime.now(UTC).isoformat(timespec="seconds")
-    document = StoreDocument(setting=setting, software=software_versions(), created=created)
-    place.create(STORE_FILE, seal(document.model_dump(mode="json")))
+    document = StoreDocument(setting=setting, software=store_software(), created=created)
+    place.create(STORE_FILE, seal(document.as_document()))
     return [STORE_FILE]
 
 
@@ -115,8 +144,10 @@ def _setting_of_any_plan(place: Place) -> Setting | None:
     for name in place.names(PLANS_FOLDER):
         key = f"{PLANS_FOLDER}/{name}"
         try:
-            return Plan.model_validate(unseal(place.read(key, MAX_DOCUMENT_BYTES), key)).setting
-        except (StoreError, ValidationError):
+            return parse_document(Plan, place.read(key, MAX_DOCUMENT_BYTES), key, "a plan").setting
+        except (UnreadableError, SchemaVersionError):
+            raise
+        except StoreError:
             continue
     return None
 
@@ -125,9 +156,8 @@ def _unfinished(store: Store) -> list[Problem]:
     """Shards without a manifest in a place where verification takes them for work in progress."""
     if not store.place.writes_in_place:
         return []
-    committed = {shard.name for shard in reader.committed_shards(store.place)}
-    names = [shard.name for shard in reader.shard_folders(store.place) if shard.name not in committed]
-    keys = [f"{SHARDS_FOLDER}/{name}" for name in names]
+    committed = set(reader.committed_jobs(store.place))
+    keys = [f"{SHARDS_FOLDER}/{job.shard_id}" for job in reader.named_jobs(store.place) if job not in committed]
     return [Problem(key, "has no manifest, so counts for nothing", broken=key) for key in keys]
 
 
@@ -135,9 +165,9 @@ def _make_plans(store: Store) -> list[str]:
     """A plan is its name and the setting, so one that is missing can be written again."""
     known = {name.removesuffix(".json") for name in store.place.names(PLANS_FOLDER)}
     made = []
-    for key in sorted({shard.name.rsplit("-", 2)[0] for shard in reader.committed_shards(store.place)} - known):
-        proposer, _, version = key.rpartition("-v")
-        store.add_plan(Plan(setting=store.setting, proposer=proposer, policy_version=int(version)))
+    for key in sorted({job.plan_key for job in reader.committed_jobs(store.place)} - known):
+        proposer, version = parse_plan_key(key)
+        store.add_plan(Plan(setting=store.setting, proposer=proposer, policy_version=version))
         made.append(f"{PLANS_FOLDER}/{key}.json")
     return made
 
@@ -154,9 +184,12 @@ def _note_lost_policies(store: Store) -> list[int]:
 def _missing(store: Store, moved: list[str]) -> list[Job]:
     """The jobs of shards that were set aside, without what other shards hold."""
     jobs = {job for key in moved if (job := parse_shard_id(key.rpartition("/")[2])) is not None}
-    held = {(m.plan_key, index) for m in store.committed() for index in range(m.start, m.stop)}
-    return [
-        job
-        for job in sorted(jobs, key=lambda job: (job.plan_key, job.start))
-        if any((job.plan_key, index) not in held for index in range(job.start, job.stop))
-    ]
+    held: dict[str, list[tuple[int, int]]] = {}
+    for job in reader.committed_jobs(store.place) if jobs else ():
+        held.setdefault(job.plan_key, []).append((job.start, job.stop))
+
+    def is_held(job: Job) -> bool:
+        inside = [(max(low, job.start), min(high, job.stop)) for low, high in held.get(job.plan_key, ())]
+        return covered(each for each in inside if each[0] < each[1]) == job.stop - job.start
+
+    return [job for job in sorted(jobs, key=order) if not is_held(job)]

@@ -32,6 +32,11 @@ def unseal(data: bytes, source: str) -> dict[str, Any]:
     return content
 
 
+def is_sealed(content: dict[str, Any]) -> bool:
+    """Whether an object carries the checksum of the rest of it."""
+    return content.get(_SEAL) == _checksum({name: value for name, value in content.items() if name != _SEAL})
+
+
 def parse_object(data: bytes, source: str) -> dict[str, Any]:
     """A JSON object from hostile bytes.
 

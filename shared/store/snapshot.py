@@ -19,7 +19,7 @@ class Snapshot(StrictModel):
         """What these parts of a store hold, which are in order of plan and rollout."""
         ranges: dict[str, list[tuple[int, int]]] = {}
         for part in parts:
-            known = ranges.setdefault(part.manifest.plan_key, [])
+            known = ranges.setdefault(part.shard.plan_key, [])
             start = known.pop()[0] if known and known[-1][1] == part.start else part.start
             known.append((start, part.stop))
         return cls(ranges={key: tuple(known) for key, known in ranges.items()})
@@ -33,8 +33,8 @@ class Snapshot(StrictModel):
         """What of some parts of the store belongs to the snapshot."""
         kept = []
         for part in parts:
-            for low, high in self.ranges.get(part.manifest.plan_key, ()):
+            for low, high in self.ranges.get(part.shard.plan_key, ()):
                 start, stop = max(part.start, low), min(part.stop, high)
                 if start < stop:
-                    kept.append(Part(part.manifest, start, stop))
+                    kept.append(Part(part.shard, start, stop))
         return kept

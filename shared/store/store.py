@@ -7,48 +7,50 @@ clouds = store.read_observations(shard_id)
 """
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-from pydantic import ValidationError
 
-from shared.errors import StoreError, UsageError
+from shared.errors import StoreError, UnreadableError, UsageError
 from shared.files import TEMPORARY_PREFIX
 from shared.plan import Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import policies, reader
-from shared.store.coverage import ROLLOUT_COLUMN, Part, parts_of
+from shared.store.coverage import Part, parts_of
 from shared.store.difference import difference_of
 from shared.store.digest import combined_digest
 from shared.store.layout import (
+    INTERACTIONS_FILE,
     LOCK_PREFIX,
     MAX_DOCUMENT_BYTES,
     PLANS_FOLDER,
     POLICIES_FOLDER,
+    ROLLOUTS_FILE,
     SHARDS_FOLDER,
     STORE_FILE,
     Quarantined,
     ShardManifest,
     StoreDocument,
+    parse_document,
     parse_shard_id,
     parse_store_document,
 )
 from shared.store.observations import ObservationArrays
 from shared.store.place import Folder, Place, is_url, place_of
-from shared.store.provenance import software_versions
-from shared.store.sealed import seal, unseal
+from shared.store.presence import DRIVER
+from shared.store.provenance import store_software
+from shared.store.sealed import seal
 from shared.store.snapshot import Snapshot
 from shared.store.tables import INTERACTION_SCHEMA, ROLLOUT_SCHEMA
 from shared.store.writer import commit_shard
 from shared.underway import UNDERWAY_FOLDER, Underway
 
 MAX_SEED = 2**64 - 1
-DRIVER = "driver"
-"""Whoever hands out jobs."""
+_TABLES_AT_ONCE = 256
 
 
 class Store:
@@ -72,12 +74,13 @@ class Store:
         return self.document.setting
 
     @classmethod
-    def create(cls, where: str | Path, setting: Setting) -> "Store":
+    def create(cls, where: str | Path, setting: Setting, more: Mapping[str, Any] | None = None) -> "Store":
         """Make a store, or open the one that is there.
 
         Args:
             where: a folder, or s3://BUCKET/PREFIX.
             setting: of all its rows.
+            more: fields that newer software wrote into the description of the store that this one is a copy of.
 
         Raises:
             StoreError: a store of another setting is there, or files that are no store, or it cannot be made.
@@ -90,13 +93,14 @@ class Store:
             if not place.exists(STORE_FILE):
                 _refuse_foreign(place)
                 created = datetime.now(UTC).isoformat(timespec="seconds")
-                document = StoreDocument(setting=setting, software=software_versions(), created=created)
-                place.create(STORE_FILE, seal(document.model_dump(mode="json")))
+                known = {"setting": setting, "software": store_software(), "created": created}
+                document = StoreDocument.model_validate(dict(more or {}) | known, extra="allow")
+                place.create(STORE_FILE, seal(document.as_document()))
         except OSError as error:
             raise StoreError(f"{where}: no store can be made here ({error.strerror}); name another folder") from None
         store = cls.open(where)
         if store.setting != setting:
-            difference = difference_of(store.setting.model_dump(mode="json"), setting.model_dump(mode="json"))
+            difference = difference_of(store.setting.as_document(), setting.as_document())
             raise StoreError(f"{where} holds another setting: {difference}; give the same, or another folder")
         return store
 
@@ -133,10 +137,10 @@ class Store:
         if self._recorded.get(plan.key) == plan:
             return
         if plan.setting != self.setting:
-            difference = difference_of(self.setting.model_dump(mode="json"), plan.setting.model_dump(mode="json"))
+            difference = difference_of(self.setting.as_document(), plan.setting.as_document())
             raise StoreError(f"{self.where}: plan {plan.key} is of another setting: {difference}")
         key = f"{PLANS_FOLDER}/{plan.key}.json"
-        made = self.place.create(key, seal(plan.model_dump(mode="json")))
+        made = self.place.create(key, seal(plan.as_document()))
         # Compared as plans: a setting that came with later software has its default in a file that lacks it.
         if not made and self.read_plan(f"{plan.key}.json") != plan:
             raise StoreError(f"{self.where}/{key}: holds another plan of this name; give this one another store")
@@ -159,44 +163,47 @@ class Store:
         """
         key = f"{PLANS_FOLDER}/{name}"
         file = f"{self.where}/{key}"
-        data = self.place.read(key, MAX_DOCUMENT_BYTES)
-        try:
-            plan = Plan.model_validate(unseal(data, file))
-        except ValidationError:
-            raise StoreError(f"{file}: is no plan; the file is damaged or foreign") from None
+        plan = parse_document(Plan, self.place.read(key, MAX_DOCUMENT_BYTES), file, "a plan")
         if f"{plan.key}.json" != name or plan.setting != self.setting:
             raise StoreError(f"{file}: is no plan of this store; the file is damaged or foreign")
         return plan
 
     def committed(self, plan_key: str | None = None) -> list[ShardManifest]:
-        """Manifests of the committed shards (of one plan), in order of name; no data are read.
+        """Manifests of the committed shards, all at once: some 20 KB each; otherwise as `manifests`."""
+        return list(self.manifests(plan_key))
+
+    def manifests(self, plan_key: str | None = None) -> Iterator[ShardManifest]:
+        """Manifests of the committed shards (of one plan), in order of plan and rollout; no data are read.
 
         Shards whose rollouts larger ones hold as well, as a compaction leaves them until it ends, are left out.
 
         Raises:
             StoreError: a manifest is damaged or foreign.
         """
-        return [part.manifest for part in self.parts(plan_key)]
+        return reader.read_manifests(self.place, (part.shard for part in self.parts(plan_key)))
 
     def jobs(self, plan_key: str | None = None) -> list[Job]:
         """The jobs (of one plan) whose shards are committed, by name; their ranges may overlap.
 
         No manifest is read: of a million shards that would take a quarter of an hour, and their names take seconds.
         """
-        return reader.committed_jobs(self.place, plan_key)
+        jobs = reader.committed_jobs(self.place, plan_key)
+        if not self.place.exists(STORE_FILE):
+            raise UnreadableError(f"{self.where}: vanished while it was read; is its disk still there?")
+        return jobs
 
     def manifest(self, job: Job) -> ShardManifest:
         """The manifest of a job's committed shard; raises as `committed` does."""
         return reader.read_manifest(reader.shard_folder(self.place, job.shard_id))
 
     def parts(self, plan_key: str | None = None) -> list[Part]:
-        """What counts of which shard, in order; raises as `committed` does."""
-        parts = parts_of(reader.read_manifests(reader.committed_shards(self.place, plan_key)))
+        """What counts of which shard, in order of plan and rollout; by the shards' names alone."""
+        parts = parts_of(self.jobs(plan_key))
         return parts if self._snapshot is None else self._snapshot.limit(parts)
 
     def rollouts_of(self, part: Part) -> list[RolloutRecord]:
         """The rollouts of a shard that count, in order; raises as `read_rollouts` does."""
-        rollouts = self.read_rollouts(part.manifest.shard_id)
+        rollouts = self.read_rollouts(part.shard.shard_id)
         return [rollout for rollout in rollouts if part.start <= rollout.index < part.stop]
 
     def tables_of(self, part: Part) -> tuple[Any, Any]:
@@ -205,9 +212,10 @@ class Store:
         Raises:
             StoreError: a file is damaged or foreign.
         """
-        shard = reader.shard_folder(self.place, part.manifest.shard_id)
-        rollouts = reader.read_rollout_table(shard, part.manifest)
-        return part.of(rollouts), part.of(reader.read_interactions(shard, part.manifest))
+        shard = reader.shard_folder(self.place, part.shard.shard_id)
+        manifest = reader.read_manifest(shard)
+        rollouts = reader.read_rollout_table(shard, manifest)
+        return part.of(rollouts), part.of(reader.read_interactions(shard, manifest))
 
     def holds(self, job: Job) -> bool:
         """Whether the shard of a job is committed."""
@@ -243,9 +251,9 @@ class Store:
         if job.plan_key != plan.key:
             raise StoreError(f"job {job.shard_id} is not of plan {plan.key}; give the plan that made it")
         self.add_plan(plan)
-        known = set(self.setting.objects)
+        known = self.setting.identities
         for rollout in rollouts:
-            if rollout.object not in known or rollout.seed != self.setting.seed:
+            if rollout.object.identity not in known or rollout.seed != self.setting.seed:
                 raise StoreError(
                     f"{job.shard_id}: rollout {rollout.index} (object {rollout.object.id}, seed {rollout.seed}) "
                     "is of another object or seed than the store's"
@@ -253,13 +261,17 @@ class Store:
         points = self.setting.collection.camera.points
         return commit_shard(self.place, job, rollouts, points, provenance, quarantined, vetted=vetted)
 
-    def only_driver(self) -> AbstractContextManager[None]:
-        """Hold the store against other drivers, which would do everything twice; in a bucket they may, without harm.
+    def only_driver(self, *, alone: bool = False) -> AbstractContextManager[Any]:
+        """Hold the store against other drivers, which would do everything twice.
+
+        Args:
+            alone: also in a bucket, where several drivers of the same plan do no harm. Those that follow a learner may
+                hand out one number under two policies.
 
         Raises:
-            UsageError: another driver holds it; the message names the process.
+            UsageError: another driver, or a repair, holds it; the message names the process.
         """
-        return self.place.only_one(DRIVER)
+        return self.place.only_one(DRIVER, alone=alone)
 
     def sweep(self) -> int:
         """Remove what dead writers left unfinished; returns how many files and folders that was."""
@@ -268,9 +280,11 @@ class Store:
 
     def digest(self, plan_key: str | None = None) -> str:
         """Content digest of the store, or of one plan: independent of shards, workers, hosts and times."""
+        parts = self.parts(plan_key)
+        manifests = reader.read_manifests(self.place, (part.shard for part in parts))
         return combined_digest(
-            (part.manifest.plan_key, index, part.manifest.digests[index - part.manifest.start])
-            for part in self.parts(plan_key)
+            (manifest.plan_key, index, manifest.digests[index - manifest.start])
+            for part, manifest in zip(parts, manifests, strict=True)
             for index in range(part.start, part.stop)
         )
 
@@ -293,14 +307,7 @@ class Store:
                 hint = f"did you mean '{close[0]}'?" if close else f"allowed: {', '.join(INTERACTION_SCHEMA.names)}"
                 raise UsageError(f"no column '{name}' in the interactions; {hint}")
         schema = pa.schema([INTERACTION_SCHEMA.field(name) for name in names])
-        parts = [part for part in self.parts() if plan_keys is None or part.manifest.plan_key in plan_keys]
-        wanted = [names if part.is_whole else list(dict.fromkeys([*names, ROLLOUT_COLUMN])) for part in parts]
-        found = reader.read_many_interactions(self.place, [part.manifest for part in parts], wanted)
-        tables = [
-            _with_shard(part.of(table).select(names), part.manifest.shard_id)
-            for part, table in zip(parts, found, strict=True)
-        ]
-        return pa.concat_tables([_with_shard(schema.empty_table(), ""), *tables])
+        return _one_table(schema, self.each(INTERACTIONS_FILE, names, plan_keys))
 
     def rollouts(self) -> Any:
         """A pyarrow table, one row a rollout, those without interactions included; "shard" says where it lies.
@@ -308,10 +315,14 @@ class Store:
         Raises:
             StoreError: a file is damaged or foreign.
         """
-        parts = self.parts()
-        found = reader.read_many_rollout_tables(self.place, [part.manifest for part in parts])
-        tables = [_with_shard(part.of(table), part.manifest.shard_id) for part, table in zip(parts, found, strict=True)]
-        return pa.concat_tables([_with_shard(ROLLOUT_SCHEMA.empty_table(), ""), *tables])
+        return _one_table(ROLLOUT_SCHEMA, self.each(ROLLOUTS_FILE, ROLLOUT_SCHEMA.names))
+
+    def each(
+        self, file: str, names: Sequence[str] | None = None, plan_keys: Sequence[str] | None = None
+    ) -> Iterator[tuple[Part, ShardManifest, Any]]:
+        """What counts of each shard, its manifest, and one of its tables (see `reader.read_tables`), in order."""
+        parts = (part for part in self.parts() if plan_keys is None or part.shard.plan_key in plan_keys)
+        return reader.read_tables(self.place, parts, file, names)
 
     def read_observations(self, shard_id: str) -> ObservationArrays:
         """All clouds of a shard.
@@ -384,6 +395,19 @@ def _refuse_foreign(place: Place) -> None:
         # The other process may have finished since, and its first shard may be there.
         if not name.startswith((TEMPORARY_PREFIX, LOCK_PREFIX)) and not place.exists(STORE_FILE):
             raise StoreError(f"{place.where}: is not empty and no store (it holds {name!r}); name an empty folder")
+
+
+def _one_table(schema: Any, found: Iterable[tuple[Part, ShardManifest, Any]]) -> Any:
+    """The tables of many shards as one, and which shard each row is of."""
+    tables = [_with_shard(schema.empty_table(), "")]
+    few: list[Any] = []
+    for part, _, table in found:
+        few.append(_with_shard(table, part.shard.shard_id))
+        if len(few) == _TABLES_AT_ONCE:
+            # Copied together: a column of one shard takes far more memory than its numbers.
+            tables.append(pa.concat_tables(few).combine_chunks())
+            few.clear()
+    return pa.concat_tables([*tables, *few])
 
 
 def _with_shard(table: Any, shard_id: str) -> Any:

@@ -1,7 +1,9 @@
 """Committing shards: all files of one, and its manifest last; the place knows how that is made all or nothing."""
 
 import hashlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from shared.errors import StoreError
 from shared.plan import Job
@@ -20,19 +22,28 @@ from shared.store.layout import (
     FileEntry,
     Quarantined,
     ShardManifest,
+    parse_manifest,
     parse_shard_id,
 )
 from shared.store.place import Folder, Place, Publication
-from shared.store.provenance import process_provenance, software_versions
-from shared.store.reader import (
-    is_committed,
-    read_manifest,
-    read_rollouts,
-    shard_folder,
-)
+from shared.store.provenance import process_provenance, store_software
+from shared.store.reader import is_committed, read_files, read_manifest, read_rollouts, shard_folder
 from shared.store.sealed import seal
 from shared.store.tables import table_bytes
 from shared.store.validity import check_quarantined, check_rollouts
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """What newer software wrote of some rollouts, and this one keeps as it is.
+
+    Attributes:
+        tables: columns of the shard's two tables, by file (see `tables.unknown_columns`).
+        fields: of the manifest.
+    """
+
+    tables: Mapping[str, Any]
+    fields: Mapping[str, Any]
 
 
 def commit_shard(
@@ -42,9 +53,9 @@ def commit_shard(
     points: int,
     provenance: Mapping[str, str],
     quarantined: Sequence[Quarantined],
-    supersedes: Collection[str] = (),
     *,
     vetted: bool = False,
+    unknown: Unknown | None = None,
 ) -> ShardManifest:
     """Write a shard and commit it; where another worker was faster, its shard stays and its manifest is returned.
 
@@ -55,8 +66,8 @@ def commit_shard(
         points: N, of every cloud.
         provenance: what else is known of how they were made, such as seconds by stage.
         quarantined: why rollouts of that status are.
-        supersedes: shards whose rollouts this one holds too, and that it may overlap.
-        vetted: whether it is known that it overlaps no other, so that this need not be looked for.
+        vetted: whether it is known that it overlaps no other, or may, so that this need not be looked for.
+        unknown: what newer software wrote of these rollouts.
 
     Raises:
         StoreError: a rollout breaks the rules of a record, or the job overlaps another shard of its plan.
@@ -66,32 +77,81 @@ def commit_shard(
         return read_manifest(shard)
     check_rollouts(rollouts, job, points, job.shard_id)
     check_quarantined(rollouts, quarantined, job.shard_id)
-    files = _encode(rollouts, points)
-
-    def admit() -> None:
-        if not vetted:
-            _refuse_overlap(place, job, supersedes)
-
-    def describe(held: Mapping[str, bytes]) -> bytes:
-        manifest = _describe(job, rollouts, held, points, provenance, quarantined)
-        if held != files:
-            _check_taken_over(shard, manifest)
-        return seal(manifest.model_dump(mode="json"))
-
-    place.publish(
-        Publication(
-            folder=shard.key,
-            files=files,
-            mark=MANIFEST_FILE,
-            describe=describe,
-            admit=admit,
-            lock=job.plan_key,
-        )
+    unknown = unknown or Unknown({}, {})
+    files = _encode(rollouts, points, unknown.tables)
+    manifest = ShardManifest(
+        plan_key=job.plan_key,
+        start=job.start,
+        stop=job.stop,
+        interactions=sum(len(rollout.interactions) for rollout in rollouts),
+        observations=sum(len(rollout.observations) for rollout in rollouts),
+        points=points,
+        files=_entries(files),
+        digests=tuple(rollout_digest(rollout) for rollout in rollouts),
+        software=store_software(),
+        # No host's name and no path goes into a manifest, also where older software wrote what is written again.
+        provenance=process_provenance() | {n: str(value) for n, value in provenance.items() if n != "host"},
+        quarantined=tuple(
+            each.model_copy(update={"command": reproduction(STORE, job.shard_id, OBJECTS, each.rollout)})
+            for each in quarantined
+        ),
     )
+    described = manifest.as_document() | dict(unknown.fields)
+    _publish(place, parse_manifest(seal(described), str(shard)), files, vetted=vetted)
     return read_manifest(shard)
 
 
-def _encode(rollouts: Sequence[RolloutRecord], points: int) -> dict[str, bytes]:
+def copy_shard(source: Folder, manifest: ShardManifest, place: Place) -> None:
+    """Commit a shard of another place as it is, to the last byte, also what this software does not know of it.
+
+    Args:
+        source: the shard.
+        manifest: its manifest.
+        place: of the store that it is copied into; known to hold none of its rollouts, unless in a shard of this name.
+
+    Raises:
+        StoreError: the shard is damaged.
+    """
+    if is_committed(shard_folder(place, manifest.shard_id)):
+        return
+    _check_digests(source, manifest)
+    _publish(place, manifest, read_files(source, manifest), vetted=True)
+
+
+def commit_files(place: Place, manifest: ShardManifest, files: Mapping[str, bytes]) -> None:
+    """Commit a shard whose files are encoded already; the manifest's entries for them are made here.
+
+    Raises:
+        StoreError: what was committed cannot be read, or holds other rollouts than the manifest says.
+    """
+    whole = manifest.model_copy(update={"files": _entries(files)})
+    _publish(place, whole, files, vetted=True)
+    _check_digests(shard_folder(place, whole.shard_id), whole)
+
+
+def _check_digests(shard: Folder, manifest: ShardManifest) -> None:
+    if tuple(rollout_digest(rollout) for rollout in read_rollouts(shard, manifest)) != manifest.digests:
+        raise StoreError(f"{shard}: its rollouts are not those of its manifest; run `adaafford store verify`")
+
+
+def _publish(place: Place, manifest: ShardManifest, files: Mapping[str, bytes], *, vetted: bool) -> None:
+    shard = shard_folder(place, manifest.shard_id)
+
+    def admit() -> None:
+        if not vetted:
+            _refuse_overlap(place, manifest.job)
+
+    def describe(held: Mapping[str, bytes]) -> bytes:
+        described = manifest
+        if held != files:
+            described = manifest.model_copy(update={"files": _entries(held)})
+            _check_taken_over(shard, described)
+        return seal(described.as_document())
+
+    place.publish(Publication(shard.key, files, MANIFEST_FILE, describe, admit, lock=manifest.plan_key))
+
+
+def _encode(rollouts: Sequence[RolloutRecord], points: int, unknown: Mapping[str, Any]) -> dict[str, bytes]:
     """All files of a shard but its manifest, by path within it."""
     rollout_rows, interaction_rows, first = [], [], 0
     for rollout in rollouts:
@@ -100,37 +160,14 @@ def _encode(rollouts: Sequence[RolloutRecord], points: int) -> dict[str, bytes]:
         first += len(rollout.observations)
     clouds = observations.encode([o for rollout in rollouts for o in rollout.observations], points)
     return {
-        ROLLOUTS_FILE: table_bytes(ROLLOUT_COLUMNS, rollout_rows),
-        INTERACTIONS_FILE: table_bytes(INTERACTION_COLUMNS, interaction_rows),
+        ROLLOUTS_FILE: table_bytes(ROLLOUT_COLUMNS, rollout_rows, unknown.get(ROLLOUTS_FILE)),
+        INTERACTIONS_FILE: table_bytes(INTERACTION_COLUMNS, interaction_rows, unknown.get(INTERACTIONS_FILE)),
         **{f"{OBSERVATIONS_FOLDER}/{name}": data for name, data in clouds.items()},
     }
 
 
-def _describe(
-    job: Job,
-    rollouts: Sequence[RolloutRecord],
-    files: Mapping[str, bytes],
-    points: int,
-    provenance: Mapping[str, str],
-    quarantined: Sequence[Quarantined],
-) -> ShardManifest:
-    """The manifest; no host's name and no path goes into it, also of shards that older software wrote."""
-    return ShardManifest(
-        plan_key=job.plan_key,
-        start=job.start,
-        stop=job.stop,
-        interactions=sum(len(rollout.interactions) for rollout in rollouts),
-        observations=sum(len(rollout.observations) for rollout in rollouts),
-        points=points,
-        files={n: FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) for n, data in files.items()},
-        digests=tuple(rollout_digest(rollout) for rollout in rollouts),
-        software=software_versions(),
-        provenance=process_provenance() | {n: str(value) for n, value in provenance.items() if n != "host"},
-        quarantined=tuple(
-            each.model_copy(update={"command": reproduction(STORE, job.shard_id, OBJECTS, each.rollout)})
-            for each in quarantined
-        ),
-    )
+def _entries(files: Mapping[str, bytes]) -> dict[str, FileEntry]:
+    return {n: FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) for n, data in files.items()}
 
 
 def _check_taken_over(shard: Folder, manifest: ShardManifest) -> None:
@@ -140,13 +177,13 @@ def _check_taken_over(shard: Folder, manifest: ShardManifest) -> None:
         raise StoreError(f"{shard}: files of another attempt lie here, of other content; run `adaafford store repair`")
 
 
-def _refuse_overlap(place: Place, job: Job, supersedes: Collection[str]) -> None:
+def _refuse_overlap(place: Place, job: Job) -> None:
     # No shard holds more than MAX_ROWS rollouts, so none that begins earlier reaches the job. From 10^8 rollouts on the
     # order of names is not that of numbers, and an overlap may be left for `verify` to find.
     first = Job(job.plan_key, max(job.start - MAX_ROWS, 0), job.stop).shard_id
     for name in place.names_from(SHARDS_FOLDER, first[: first.rindex("-")]):
         other = parse_shard_id(name)
-        if other is None or other == job or name in supersedes:
+        if other is None or other == job:
             continue
         if other.plan_key != job.plan_key or other.start >= job.stop:
             return

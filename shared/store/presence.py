@@ -1,0 +1,136 @@
+"""Who is at work on a store: drivers, which may be several in a bucket, and whoever must be alone, such as a repair.
+
+A disk has locks for that. A bucket has none, so each holder there leaves a mark that it renews, and looks for others
+after its own is written: of two that come at the same time, at least one sees the other.
+
+    STORE/status/driver-<process>-<n>.json    a mark; about the moment, so no data
+"""
+
+import secrets
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+
+from pydantic import Field, ValidationError
+
+from shared.configuration import StrictModel
+from shared.errors import MissingError, StoreError, UsageError
+from shared.files import is_gone, process_name
+from shared.store.layout import STATUS_FOLDER
+from shared.store.place import Place
+from shared.underway import workers_at_work
+
+DRIVER = "driver"
+"""Name of the lock of whoever hands out jobs, and of whoever must not meet one."""
+BEAT_S = 5.0
+SILENT_S = 30.0
+"""A holder that has not renewed its mark for so long has ended; clocks of machines may differ by some seconds."""
+_MAX_MARK_BYTES = 1 << 12
+
+
+class Mark(StrictModel):
+    """What a holder says of itself."""
+
+    process: str = Field(max_length=200)
+    """As `shared.files.process_name` has it."""
+    alone: bool
+    """Whether it must be the only one."""
+    written: float = Field(ge=0)
+    """Seconds since 1970."""
+
+    def is_alive(self, now: float) -> bool:
+        """Whether its process is at work, as far as that can be told from here."""
+        return not is_gone(self.process) and now - self.written < SILENT_S
+
+
+class Presence:
+    """A holder of a place without locks; use as a context.
+
+    Args:
+        place: where the mark lies.
+        name: what is held.
+        alone: whether there must be no other holder; without it, there may be others of this kind.
+    """
+
+    def __init__(self, place: Place, name: str, *, alone: bool) -> None:
+        self._place, self._name, self._alone = place, name, alone
+        self._key = f"{STATUS_FOLDER}/{name}-{process_name()}-{secrets.token_hex(4)}.json"
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._renew, name="presence", daemon=True)
+
+    def __enter__(self) -> "Presence":
+        """Leave the mark, and look for others.
+
+        Raises:
+            UsageError: another holder must be alone, or this one must and there is another.
+        """
+        self._write()
+        try:
+            self._refuse_others()
+        except BaseException:
+            self._place.remove(self._key)
+            raise
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Remove the mark."""
+        self._stop.set()
+        self._thread.join()
+        try:
+            self._place.remove(self._key)
+        except StoreError:
+            return  # It is silent from now on, which says the same some seconds later.
+
+    def _write(self) -> None:
+        mark = Mark(process=process_name(), alone=self._alone, written=time.time())
+        self._place.replace(self._key, mark.model_dump_json().encode())
+
+    def _renew(self) -> None:
+        while not self._stop.wait(BEAT_S):
+            try:
+                self._write()
+            except StoreError:
+                continue  # The work itself meets whatever is wrong with the place.
+
+    def _refuse_others(self) -> None:
+        for key, mark in self._others():
+            if not mark.is_alive(time.time()):
+                self._place.remove(key)
+            elif mark.alone or self._alone:
+                raise UsageError(
+                    f"{self._place.where} is in use by process {mark.process}; wait for it or stop it "
+                    f"(one that was killed is forgotten after {SILENT_S:.0f} s)"
+                )
+
+    def _others(self) -> Iterator[tuple[str, Mark]]:
+        for name in self._place.names(STATUS_FOLDER):
+            key = f"{STATUS_FOLDER}/{name}"
+            if not name.startswith(f"{self._name}-") or key == self._key:
+                continue
+            try:
+                yield key, Mark.model_validate_json(self._place.read(key, _MAX_MARK_BYTES))
+            except (MissingError, ValidationError):
+                continue  # It has ended meanwhile, or it is no mark.
+
+
+@contextmanager
+def alone(place: Place) -> Iterator[None]:
+    """Hold a store against drivers, against others who must be alone, and in a bucket against workers as well.
+
+    On a disk a worker that has lost its driver does no harm: its shard is renamed to its place as a whole.
+
+    Raises:
+        UsageError: somebody is at work; the message names the process.
+    """
+    with place.only_one(DRIVER, alone=True):
+        for process in workers_at_work(place.where, time.time()) if place.writes_in_place else ():
+            raise UsageError(
+                f"{place.where} is in use by worker process {process}, whose driver has ended; stop that process, or "
+                "wait until it has been silent for ten minutes"
+            )
+        yield
