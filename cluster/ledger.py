@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from shared.errors import UsageError
+from shared.files import read_named
 
 BEAT_S = 5.0
 """A stage under way is noted this often; a kill loses at most so much of its wall time."""
@@ -93,18 +93,17 @@ class Ledger:
         self._results[name] = outcome[-1]
 
     def _replay(self) -> None:
-        if self._path.stat().st_size > MAX_LOG_BYTES:
-            raise UsageError(f"{self._path}: larger than {MAX_LOG_BYTES} bytes; not the log of a run")
-        for line in self._path.read_bytes().splitlines():
+        for line in read_named(self._path, MAX_LOG_BYTES, "not the log of a run").splitlines():
             try:
                 entry = json.loads(line)
                 stage, seconds = entry.get("stage"), entry.get("seconds")
-            except (ValueError, AttributeError):
+                seconds = float(seconds) if isinstance(seconds, int | float) else None
+            except (ValueError, AttributeError, OverflowError, RecursionError):
                 continue  # Torn by a kill.
-            if isinstance(stage, str) and isinstance(seconds, int | float):
-                self._seconds[stage] = float(seconds)
-                if entry.get("event") == "done":
-                    self._results[stage] = entry.get("result", {})
+            if isinstance(stage, str) and seconds is not None:
+                self._seconds[stage] = seconds
+                if entry.get("event") == "done" and isinstance(entry.get("result"), dict):
+                    self._results[stage] = entry["result"]
 
 
 def _repeat(beat: Callable[[], None], stop: threading.Event) -> None:

@@ -178,13 +178,15 @@ def _training(files: Iterable[Path]) -> TrainingStanding | None:
 
 def _last_line(file: Path) -> dict[str, Any] | None:
     """The last whole line of a file of JSON lines; None if there is none."""
+    if not file.is_file():
+        return None
     with file.open("rb") as stream:
         stream.seek(max(file.stat().st_size - MAX_TAIL_BYTES, 0))
         lines = stream.read(MAX_TAIL_BYTES).splitlines()
     for line in reversed(lines):
         try:
             found = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue  # Torn, or begun before the tail.
         if isinstance(found, dict):
             return found

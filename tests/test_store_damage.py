@@ -59,6 +59,15 @@ def forge(shard: Path, contents: dict[str, bytes], **changes: Any) -> None:
     (shard / "manifest.json").write_bytes(seal(manifest | changes))
 
 
+def packed(table: Any, **options: Any) -> bytes:
+    """A Parquet file of the kinds of pages that the store writes, unless the options say otherwise."""
+    texts = [field.name for field in table.schema if field.type == pa.string()]
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, **({"use_dictionary": texts, "compression": "zstd"} | options))
+    data: bytes = sink.getvalue().to_pybytes()
+    return data
+
+
 def refused(act: Callable[[], object], message: str) -> None:
     with pytest.raises(StoreError, match=message) as caught:
         act()
@@ -147,9 +156,9 @@ def test_data_swapped_for_other_valid_data_is_found_by_the_digest(store: Store, 
     table = pq.read_table(shard / "interactions.parquet")
     flipped = [not success for success in table.column("success").to_pylist()]
     index = table.schema.get_field_index("success")
-    sink = pa.BufferOutputStream()
-    pq.write_table(table.set_column(index, table.schema.field(index), pa.array(flipped)), sink)
-    forge(shard, {"interactions.parquet": sink.getvalue().to_pybytes()})
+    forge(
+        shard, {"interactions.parquet": packed(table.set_column(index, table.schema.field(index), pa.array(flipped)))}
+    )
     assert any("not the one whose digest" in problem.what for problem in verify(store))
 
 
@@ -158,9 +167,7 @@ def test_a_frame_that_disagrees_is_found(store: Store, shard: Path) -> None:
     for name in ("rotation_camera", "joint_friction", "object_category"):
         index = table.schema.get_field_index(name)
         column = table.column(index).take(pa.array([0] * len(table)))
-        sink = pa.BufferOutputStream()
-        pq.write_table(table.set_column(index, table.schema.field(index), column), sink)
-        forge(shard, {"interactions.parquet": sink.getvalue().to_pybytes()})
+        forge(shard, {"interactions.parquet": packed(table.set_column(index, table.schema.field(index), column))})
         assert any(f"column {name} does not agree" in problem.what for problem in verify(store))
 
 
@@ -169,22 +176,31 @@ def changed(shard: Path, name: str, value: Any) -> bytes:
     table = pq.read_table(shard / "interactions.parquet")
     index = table.schema.get_field_index(name)
     field = table.schema.field(index)
-    sink = pa.BufferOutputStream()
-    pq.write_table(table.set_column(index, field, pa.array([value] * len(table), field.type)), sink)
-    data: bytes = sink.getvalue().to_pybytes()
-    return data
+    return packed(table.set_column(index, field, pa.array([value] * len(table), field.type)))
 
 
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("point", [float("nan")] * 3, "point holds a number that is not finite"),
+        ("point", [float("nan")] * 3, "column point holds a number that is not finite"),
         ("motion", float("inf"), "not finite"),
+        ("motion", float("nan"), "not finite"),
+        ("motion", -1.0, "motion is -1.0"),
+        ("part_mass", float("nan"), "not finite"),
+        ("joint_limits", [float("-inf")] * 2, "not finite"),
         ("rollout_observation", 7, "refers to observation 7 of 1"),
-        ("point_index", -1, "refers to point -1"),
+        ("observation", 2**31 - 1, "column observation goes from 2147483647"),
+        ("point_index", -1, "column point_index goes from -1"),
         ("target_part", 200, "target part 200"),
-        ("outcome", "splendid", "'splendid' is not a valid OutcomeKind"),
+        ("target_part", 2**31 - 1, "column target_part goes from"),
+        ("outcome", "splendid", "column outcome holds 'splendid'"),
+        ("order", "", "column order holds ''"),
         ("target_link", "x" * 1000, "text of 1000 characters"),
+        ("object_id", "x" * 3_000_000, "text of 3000000 characters|unpacks to more than"),
+        ("proposer", "a\x1b[2Jb", "'a.\\[2Jb'"),
+        ("joint_names", "[" * 20_000, "not a record|recursion"),
+        ("joint_names", '{"a": 1}', "joint_names is no list of names"),
+        ("joint_names", "[[]]", "joint_names is no list of names"),
         ("step", 0, "steps must grow"),
     ],
 )
@@ -195,18 +211,15 @@ def test_rows_that_are_no_records_are_refused(store: Store, shard: Path, name: s
 
 
 def test_tables_of_other_columns_are_refused(store: Store, shard: Path) -> None:
-    sink = pa.BufferOutputStream()
-    pq.write_table(pq.read_table(shard / "interactions.parquet").drop_columns(["motion"]), sink)
-    forge(shard, {"interactions.parquet": sink.getvalue().to_pybytes()})
+    table = pq.read_table(shard / "interactions.parquet").drop_columns(["motion"])
+    forge(shard, {"interactions.parquet": packed(table)})
     refused(store.interactions, "has other columns")
     forge(shard, {"interactions.parquet": b"PAR1 but not really PAR1"})
     refused(lambda: info(store), "cannot be decoded")
 
 
 def test_tables_of_other_length_are_refused(store: Store, shard: Path) -> None:
-    sink = pa.BufferOutputStream()
-    pq.write_table(pq.read_table(shard / "interactions.parquet").slice(0, 3), sink)
-    forge(shard, {"interactions.parquet": sink.getvalue().to_pybytes()})
+    forge(shard, {"interactions.parquet": packed(pq.read_table(shard / "interactions.parquet").slice(0, 3))})
     refused(store.interactions, "the manifest says 16 rows")
 
 

@@ -22,9 +22,10 @@ from typing import Any
 from pydantic import Field, ValidationError, model_validator
 
 from shared.configuration import StrictModel
+from shared.documents import parse_object, problem_of
 from shared.errors import StoreError
 from shared.plan import Job, Setting
-from shared.store.sealed import parse_object, unseal
+from shared.store.sealed import unseal
 
 SCHEMA_VERSION = 1
 STORE_FILE = "store.json"
@@ -47,6 +48,10 @@ MAX_ALL_POINTS = 1 << 25
 """Bounds of one shard: rollouts, interactions and observations; N; and points of all clouds. A hostile manifest
 cannot ask for unbounded work."""
 
+MAX_MANIFEST_VALUES = 6 * MAX_ROWS
+"""A digest of each rollout, four values where it was given up, and the files."""
+MAX_ROLLOUTS = 10**12
+"""Of a plan: the names of shards have room for no more."""
 MAX_REASON = 500
 """Characters."""
 
@@ -77,8 +82,8 @@ class ShardManifest(StrictModel):
 
     schema_version: int = SCHEMA_VERSION
     plan_key: str = Field(pattern=rf"^{PLAN_KEY}$")
-    start: int = Field(ge=0)
-    stop: int = Field(ge=1)
+    start: int = Field(ge=0, lt=MAX_ROLLOUTS)
+    stop: int = Field(ge=1, le=MAX_ROLLOUTS)
     interactions: int = Field(ge=0, le=MAX_ROWS)
     observations: int = Field(ge=0, le=MAX_ROWS)
     points: int = Field(ge=1, le=MAX_POINTS)
@@ -136,11 +141,11 @@ def parse_manifest(data: bytes, source: str) -> ShardManifest:
     Raises:
         StoreError: damaged, foreign, or of another schema version.
     """
-    check_schema_version(parse_object(data, source), source)
+    check_schema_version(parse_object(data, source, MAX_MANIFEST_VALUES), source)
     try:
-        return ShardManifest.model_validate(unseal(data, source))
+        return ShardManifest.model_validate(unseal(data, source, MAX_MANIFEST_VALUES))
     except ValidationError as error:
-        raise StoreError(f"{source}: not a manifest ({_first(error)})") from None
+        raise StoreError(f"{source}: not a manifest ({problem_of(error)})") from None
 
 
 def parse_store_document(data: bytes, source: str) -> StoreDocument:
@@ -153,7 +158,7 @@ def parse_store_document(data: bytes, source: str) -> StoreDocument:
     try:
         return StoreDocument.model_validate(unseal(data, source))
     except ValidationError as error:
-        raise StoreError(f"{source}: not a store's description ({_first(error)})") from None
+        raise StoreError(f"{source}: not a store's description ({problem_of(error)})") from None
 
 
 def check_schema_version(content: dict[str, Any], source: str) -> None:
@@ -177,8 +182,3 @@ def parse_shard_id(name: str) -> Job | None:
         return None
     job = Job(match["plan"], int(match["start"]), int(match["stop"]))
     return job if job.start < job.stop and job.shard_id == name else None
-
-
-def _first(error: ValidationError) -> str:
-    problem = error.errors()[0]
-    return f"{'.'.join(str(part) for part in problem['loc']) or 'content'}: {problem['msg']}"[:160]

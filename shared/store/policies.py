@@ -7,13 +7,14 @@ from collections.abc import Mapping
 from pydantic import ValidationError
 
 from shared.configuration import StrictModel
+from shared.documents import parse_object, problem_of
 from shared.errors import StoreError
 from shared.store.layout import MAX_DOCUMENT_BYTES, POLICIES_FOLDER, SCHEMA_VERSION, FileEntry, check_schema_version
 from shared.store.place import Folder, Place, Publication
-from shared.store.sealed import parse_object, seal, unseal
+from shared.store.sealed import seal, unseal
 
 INDEX_FILE = "index.json"
-MAX_POLICY_BYTES = 1 << 30
+MAX_POLICY_BYTES = (1 << 28) + (1 << 20)
 MAX_VERSION = 999_999
 _FILE_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,99}")
 
@@ -73,8 +74,8 @@ def read_policy(place: Place, version: int) -> dict[str, bytes]:
     check_schema_version(parse_object(data, path), path)
     try:
         index = PolicyIndex.model_validate(unseal(data, path))
-    except ValidationError:
-        raise StoreError(f"{path}: not the index of a policy; the file is damaged or foreign") from None
+    except ValidationError as error:
+        raise StoreError(f"{path}: not the index of a policy ({problem_of(error)}); it is damaged or foreign") from None
     sizes = sum(entry.size for entry in index.files.values())
     if index.version != version or not all(map(_allowed, index.files)) or sizes > MAX_POLICY_BYTES:
         raise StoreError(f"{path}: not the index of policy {version}; the file is foreign")

@@ -1,17 +1,18 @@
 """Reading shards, which are hostile until their sizes, checksums, schemas and references have been checked."""
 
 import hashlib
-import json
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from pydantic_core import from_json
 
 from shared.errors import StoreError
 from shared.plan import Job, ObjectRef
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store import observations
-from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS
+from shared.store.columns import INTERACTION_COLUMNS, MAX_TEXT, ROLLOUT_COLUMNS
 from shared.store.layout import (
     INTERACTIONS_FILE,
     MANIFEST_FILE,
@@ -25,8 +26,8 @@ from shared.store.layout import (
 )
 from shared.store.observations import ObservationArrays
 from shared.store.place import Folder, Place
-from shared.store.tables import INTERACTION_SCHEMA, MAX_ROW_BYTES, ROLLOUT_SCHEMA, column_values, read_table
-from shared.store.validity import check_quarantined, check_rollouts
+from shared.store.tables import column_values, read_table, size_limit
+from shared.store.validity import MAX_PARTS, check_quarantined, check_rollouts
 from shared.vocabulary import (
     Action,
     Direction,
@@ -109,12 +110,11 @@ def checked_manifest(shard: Folder, data: bytes) -> ShardManifest:
 
 def expected_files(manifest: ShardManifest) -> dict[str, int]:
     """Paths of all files that the shard must have, and the most bytes each may have, from the counts alone."""
-    clouds = observations.size_limit(manifest.observations, manifest.points)
-    names = observations.file_names(manifest.observations, manifest.points)
+    clouds = observations.file_limits(manifest.observations, manifest.points)
     return {
-        ROLLOUTS_FILE: (manifest.rollouts + 16) * MAX_ROW_BYTES,
-        INTERACTIONS_FILE: (manifest.interactions + 16) * MAX_ROW_BYTES,
-        **{f"{OBSERVATIONS_FOLDER}/{name}": clouds for name in names},
+        ROLLOUTS_FILE: size_limit(manifest.rollouts),
+        INTERACTIONS_FILE: size_limit(manifest.interactions),
+        **{f"{OBSERVATIONS_FOLDER}/{name}": limit for name, limit in clouds},
     }
 
 
@@ -143,36 +143,76 @@ def _checked(shard: Folder, manifest: ShardManifest, name: str, data: bytes) -> 
 
 def read_interactions(shard: Folder, manifest: ShardManifest) -> Any:
     """The table of a shard's interactions."""
-    data = read_file(shard, manifest, INTERACTIONS_FILE)
-    return read_table(data, INTERACTION_SCHEMA, manifest.interactions, f"{shard}/{INTERACTIONS_FILE}")
+    return _interactions(read_file(shard, manifest, INTERACTIONS_FILE), shard, manifest)
 
 
 def read_rollout_table(shard: Folder, manifest: ShardManifest) -> Any:
     """The table of a shard's rollouts."""
-    data = read_file(shard, manifest, ROLLOUTS_FILE)
-    return read_table(data, ROLLOUT_SCHEMA, manifest.rollouts, f"{shard}/{ROLLOUTS_FILE}")
+    return _rollouts(read_file(shard, manifest, ROLLOUTS_FILE), shard, manifest)
 
 
 def read_many_interactions(
     place: Place, manifests: Sequence[ShardManifest], names: Sequence[Sequence[str]]
 ) -> Iterator[Any]:
     """Some columns of the interactions of many shards, which a bucket gives at once; raises as `read_file` does."""
-    return _read_tables(place, manifests, INTERACTIONS_FILE, INTERACTION_SCHEMA, names)
+    contents = _read_file_of_many(place, manifests, INTERACTIONS_FILE)
+    for (shard, manifest, data), columns in zip(contents, names, strict=True):
+        yield _interactions(data, shard, manifest, columns)
 
 
 def read_many_rollout_tables(place: Place, manifests: Sequence[ShardManifest]) -> Iterator[Any]:
     """The rollouts of many shards, likewise."""
-    return _read_tables(place, manifests, ROLLOUTS_FILE, ROLLOUT_SCHEMA, [None] * len(manifests))
+    for shard, manifest, data in _read_file_of_many(place, manifests, ROLLOUTS_FILE):
+        yield _rollouts(data, shard, manifest)
 
 
-def _read_tables(
-    place: Place, manifests: Sequence[ShardManifest], file: str, schema: Any, names: Sequence[Sequence[str] | None]
-) -> Iterator[Any]:
+def _read_file_of_many(
+    place: Place, manifests: Sequence[ShardManifest], file: str
+) -> Iterator[tuple[Folder, ShardManifest, bytes]]:
     shards = [shard_folder(place, manifest.shard_id) for manifest in manifests]
     wanted = [(f"{shard.key}/{file}", m.files[file].size) for shard, m in zip(shards, manifests, strict=True)]
-    for shard, manifest, columns, data in zip(shards, manifests, names, place.read_all(wanted), strict=True):
-        rows = manifest.interactions if file == INTERACTIONS_FILE else manifest.rollouts
-        yield read_table(_checked(shard, manifest, file, data), schema, rows, f"{shard}/{file}", columns)
+    for shard, manifest, data in zip(shards, manifests, place.read_all(wanted), strict=True):
+        yield shard, manifest, _checked(shard, manifest, file, data)
+
+
+def _interactions(data: bytes, shard: Folder, manifest: ShardManifest, names: Sequence[str] | None = None) -> Any:
+    """The interactions of a shard, whose references lead to what the shard has."""
+    source = f"{shard}/{INTERACTIONS_FILE}"
+    table = read_table(data, INTERACTION_COLUMNS, manifest.interactions, source, names)
+    ranges = {
+        "rollout": (manifest.start, manifest.stop),
+        "observation": (0, manifest.observations),
+        "point_index": (0, manifest.points),
+        "target_part": (1, MAX_PARTS + 1),
+    }
+    for name, (low, high) in ranges.items():
+        if name not in table.column_names or not len(table):
+            continue
+        numbers = table.column(name).to_numpy()
+        if numbers.min() < low or numbers.max() >= high:
+            raise StoreError(
+                f"{source}: column {name} goes from {numbers.min()} to {numbers.max()}, the manifest allows {low} to "
+                f"{high - 1}; the file is foreign"
+            )
+    return table
+
+
+def _rollouts(data: bytes, shard: Folder, manifest: ShardManifest) -> Any:
+    """The rollouts of a shard, which add up to what the manifest says."""
+    table = read_table(data, ROLLOUT_COLUMNS, manifest.rollouts, f"{shard}/{ROLLOUTS_FILE}")
+    clouds, tries, firsts, numbers = (
+        table.column(name).to_numpy() for name in ("observations", "interactions", "first_observation", "rollout")
+    )
+    most = max(manifest.observations, manifest.interactions)
+    if min(clouds.min(), tries.min()) < 0 or max(clouds.max(), tries.max()) > most:
+        raise StoreError(
+            f"{shard}: a rollout has a number of rows or observations that the shard has not; it is foreign"
+        )
+    if (clouds.sum(), tries.sum()) != (manifest.observations, manifest.interactions):
+        raise StoreError(f"{shard}: the rollouts do not add up to the shard's rows and observations; it is foreign")
+    if (firsts != np.cumsum(clouds) - clouds).any() or (numbers != np.arange(manifest.start, manifest.stop)).any():
+        raise StoreError(f"{shard}: the rollouts do not follow each other; it is foreign")
+    return table
 
 
 def read_observations(shard: Folder, manifest: ShardManifest) -> ObservationArrays:
@@ -193,15 +233,10 @@ def read_rollouts(shard: Folder, manifest: ShardManifest) -> tuple[RolloutRecord
     heads = _rows(read_rollout_table(shard, manifest), ROLLOUT_COLUMNS)
     rows = _rows(read_interactions(shard, manifest), INTERACTION_COLUMNS)
     arrays = read_observations(shard, manifest)
-    counts = [int(head["observations"]) for head in heads], [int(head["interactions"]) for head in heads]
-    firsts = np.cumsum([0, *counts[0]])[:-1].tolist()
-    if min((*counts[0], *counts[1])) < 0 or [sum(c) for c in counts] != [len(arrays), len(rows)]:
-        raise StoreError(f"{shard}: the rollouts do not add up to the shard's rows and observations; it is foreign")
-    if [int(head["first_observation"]) for head in heads] != firsts:
-        raise StoreError(f"{shard}: the rollouts do not follow each other in the observations; it is foreign")
     rollouts, row = [], 0
     try:
-        for head, first, clouds, tries in zip(heads, firsts, *counts, strict=True):
+        for head in heads:
+            first, clouds, tries = (int(head[name]) for name in ("first_observation", "observations", "interactions"))
             seen = tuple(arrays.observation(k) for k in range(first, first + clouds))
             rollouts.append(_rollout(head, seen, rows[row : row + tries]))
             row += tries
@@ -269,10 +304,23 @@ def _interaction(row: dict[str, Any]) -> InteractionRecord:
         target_part=int(row["target_part"]),
         target_link=row["target_link"],
         target_joint=row["target_joint"],
-        joint_names=tuple(map(str, json.loads(row["joint_names"]))),
+        joint_names=_joint_names(row["joint_names"]),
         joint_positions=row["joint_positions"],
         joint_limits=row["joint_limits"].reshape(-1, 2),
         joint_twist=row["joint_twist"],
         hand_start=row["hand_start"],
         seconds=float(row["seconds"]),
     )
+
+
+@lru_cache(maxsize=1024)
+def _joint_names(text: str) -> tuple[str, ...]:
+    """The names in a cell; a store has few different ones.
+
+    Raises:
+        ValueError: it is no list of names.
+    """
+    names = from_json(text)
+    if not isinstance(names, list) or not all(isinstance(name, str) and len(name) <= MAX_TEXT for name in names):
+        raise ValueError(f"joint_names is no list of names: {text[:40]!r}")
+    return tuple(names)
