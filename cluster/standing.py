@@ -21,6 +21,8 @@ from shared.store import Store
 from shared.store.layout import SHARDS_FOLDER, STORE_FILE, parse_shard_id
 from shared.store.place import is_url
 
+LARGEST_NUMBER = 1e300
+"""Of a metric that is shown; an integer may be too large to be a float."""
 MAX_TAIL_BYTES = 1 << 14
 """Of a file of metrics; a line is far shorter."""
 
@@ -167,19 +169,21 @@ def _jobs(store: Store) -> Iterable[Job]:
 
 def _training(files: Iterable[Path]) -> TrainingStanding | None:
     """Of the stage that was validated last."""
-    written = {file: file.stat().st_mtime for file in files}
+    written = {file: file.stat().st_mtime for file in files if file.is_file()}
     for file in sorted(written, key=lambda file: written[file], reverse=True):
         line = _last_line(file)
         if line is not None:
-            numbers = {name: float(value) for name, value in line.items() if isinstance(value, int | float)}
+            numbers = {
+                name: float(value)
+                for name, value in line.items()
+                if isinstance(value, int | float) and abs(value) < LARGEST_NUMBER
+            }
             return TrainingStanding(file.parent.name, int(numbers.pop("step", 0)), written[file], numbers)
     return None
 
 
 def _last_line(file: Path) -> dict[str, Any] | None:
     """The last whole line of a file of JSON lines; None if there is none."""
-    if not file.is_file():
-        return None
     with file.open("rb") as stream:
         stream.seek(max(file.stat().st_size - MAX_TAIL_BYTES, 0))
         lines = stream.read(MAX_TAIL_BYTES).splitlines()

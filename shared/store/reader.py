@@ -205,9 +205,7 @@ def _rollouts(data: bytes, shard: Folder, manifest: ShardManifest) -> Any:
     )
     most = max(manifest.observations, manifest.interactions)
     if min(clouds.min(), tries.min()) < 0 or max(clouds.max(), tries.max()) > most:
-        raise StoreError(
-            f"{shard}: a rollout has a number of rows or observations that the shard has not; it is foreign"
-        )
+        raise StoreError(f"{shard}: a rollout has more or fewer rows than the shard; it is foreign")
     if (clouds.sum(), tries.sum()) != (manifest.observations, manifest.interactions):
         raise StoreError(f"{shard}: the rollouts do not add up to the shard's rows and observations; it is foreign")
     if (firsts != np.cumsum(clouds) - clouds).any() or (numbers != np.arange(manifest.start, manifest.stop)).any():
