@@ -75,7 +75,7 @@ def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Seq
     wanted = [column for column in columns if names is None or column.name in names]
     try:
         table = _read(data, columns, wanted, rows, source)
-    except (pa.ArrowException, OSError, ValueError, OverflowError) as error:
+    except (pa.ArrowException, OSError, ValueError, LookupError, OverflowError) as error:
         if isinstance(error, StoreError):
             raise
         line = printable(" ".join(str(error).split()), 100)
