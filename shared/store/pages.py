@@ -52,6 +52,9 @@ def _walk(data: bytes, column: Any, rows: int, most: int, most_pages: int) -> tu
     name, kind = column.path_in_schema[:80], column.physical_type
     if column.compression not in _CODECS or (kind != _TEXT and kind not in _ITEM_BITS):
         raise ValueError(f"column {name} is {kind} in {column.compression}")
+    if not column.num_values:
+        # No page is read, and a file without rows has none.
+        return 0, 0
     start = column.data_page_offset
     if column.has_dictionary_page and 0 < (column.dictionary_page_offset or 0) < start:
         start = column.dictionary_page_offset
