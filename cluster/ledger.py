@@ -110,8 +110,9 @@ class Ledger:
         self._results[name] = outcome[-1]
 
     def _replay(self) -> None:
-        if self._path.stat().st_size > MAX_LOG_BYTES:
-            raise UsageError(f"{self._path}: larger than {MAX_LOG_BYTES} bytes; not the log of a run")
+        # Also what is no file, such as a pipe, which would be waited for.
+        if not self._path.is_file() or self._path.stat().st_size > MAX_LOG_BYTES:
+            raise UsageError(f"{self._path}: no file of at most {MAX_LOG_BYTES} bytes; not the log of a run")
         # Of the heartbeats, nearly all of a long log, only the last of each stage counts: others are not even parsed.
         beats: dict[bytes, bytes] = {}
         with self._path.open("rb") as file:
@@ -130,14 +131,15 @@ class Ledger:
             try:
                 entry = json.loads(line)
                 stage, seconds, software = entry.get("stage"), entry.get("seconds"), entry.get("software")
-            except (ValueError, AttributeError, RecursionError):
+                seconds = float(seconds) if isinstance(seconds, int | float) else None
+            except (ValueError, AttributeError, OverflowError, RecursionError):
                 continue  # Torn by a kill.
-            if isinstance(stage, str) and isinstance(seconds, int | float):
+            if isinstance(stage, str) and seconds is not None:
                 if stage not in self._seconds and len(self._seconds) >= MAX_STAGES:
                     continue
-                self._seconds[stage] = float(seconds)
-                if entry.get("event") == "done":
-                    self._results[stage] = entry.get("result", {})
+                self._seconds[stage] = seconds
+                if entry.get("event") == "done" and isinstance(entry.get("result"), dict):
+                    self._results[stage] = entry["result"]
             if isinstance(software, dict) and len(self._software) < MAX_SOFTWARE and software not in self._software:
                 self._software.append({str(name): str(version)[:MAX_VERSION] for name, version in software.items()})
         lines.clear()

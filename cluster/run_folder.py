@@ -27,7 +27,8 @@ from typing import Any
 from cluster.configuration import EXECUTION_SETTINGS, CampaignConfig
 from cluster.settings import difference
 from shared.configuration import StrictModel, parse
-from shared.errors import StoreError, UsageError
+from shared.documents import parse_object
+from shared.errors import UsageError
 from shared.files import create_exclusively, read_bounded, write_atomically
 from shared.plan import ObjectRef
 from shared.store.provenance import software_versions
@@ -282,10 +283,4 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         StoreError: the file is missing, too large or damaged.
     """
-    try:
-        document = json.loads(read_bounded(path, MAX_DOCUMENT_BYTES))
-    except (ValueError, RecursionError):
-        raise StoreError(f"{path}: not valid JSON; the run's folder is damaged") from None
-    if not isinstance(document, dict):
-        raise StoreError(f"{path}: not a JSON object; the run's folder is damaged")
-    return document
+    return parse_object(read_bounded(path, MAX_DOCUMENT_BYTES), str(path), unique=True)

@@ -22,6 +22,8 @@ from shared.store.layout import SHARDS_FOLDER, STORE_FILE, parse_shard_id
 from shared.store.place import is_url
 from shared.store.provenance import host_of
 
+LARGEST_NUMBER = 1e300
+"""Of a metric that is shown; an integer may be too large to be a float."""
 MAX_TAIL_BYTES = 1 << 14
 """Of a file of metrics; a line is far shorter."""
 
@@ -172,11 +174,15 @@ def _jobs(store: Store) -> Iterable[Job]:
 
 def _training(files: Iterable[Path]) -> TrainingStanding | None:
     """Of the stage that was validated last."""
-    written = {file: file.stat().st_mtime for file in files}
+    written = {file: file.stat().st_mtime for file in files if file.is_file()}
     for file in sorted(written, key=lambda file: written[file], reverse=True):
         line = _last_line(file)
         if line is not None:
-            numbers = {name: float(value) for name, value in line.items() if isinstance(value, int | float)}
+            numbers = {
+                name: float(value)
+                for name, value in line.items()
+                if isinstance(value, int | float) and abs(value) < LARGEST_NUMBER
+            }
             return TrainingStanding(file.parent.name, int(numbers.pop("step", 0)), written[file], numbers)
     return None
 
@@ -189,7 +195,7 @@ def _last_line(file: Path) -> dict[str, Any] | None:
     for line in reversed(lines):
         try:
             found = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue  # Torn, or begun before the tail.
         if isinstance(found, dict):
             return found

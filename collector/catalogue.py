@@ -17,6 +17,7 @@ from collector.files import short
 from collector.partnet import URDF_FILE, read_object, urdf_of
 from shared.configuration import Collision
 from shared.errors import ObjectError, UsageError
+from shared.files import read_named
 from shared.plan import ObjectRef
 from shared.seeds import generator
 from shared.tasks import Task
@@ -105,13 +106,9 @@ def read_list(path: Path) -> tuple[str, ...]:
     Raises:
         UsageError: the list cannot be read, or a line does not start with an id.
     """
+    advice = "name a list of '<id> <category>' lines"
     try:
-        # What is missing fails here, with its reason; a pipe is never opened, since reading it could block for ever.
-        if path.stat().st_size > MAX_LIST_BYTES or not path.is_file():
-            raise UsageError(f"{path}: not a file of at most {MAX_LIST_BYTES} bytes; name '<id> <category>' lines")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read ({error.strerror}); name a list of '<id> <category>' lines") from None
+        lines = read_named(path, MAX_LIST_BYTES, advice).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise UsageError(f"{path}: not text; name a list of '<id> <category>' lines") from None
     ids = [line.split()[0] for line in lines if line.strip()]

@@ -14,13 +14,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
+from pydantic import BaseModel, Field
+
 from learner import sharing
 from learner.configuration import AlternationConfig, LearnerConfig
 from learner.hardware import Hardware
 from learner.recipes import ORACLE_FILE
-from learner.stages import DONE_FILE, MAX_DONE_BYTES, Memory, StageJob, StageName, run_stage
+from learner.stages import DONE_FILE, MAX_DONE_BYTES, Memory, StageJob, StageName, read_done, run_stage
+from shared.documents import read_document
 from shared.errors import StoreError, UsageError
-from shared.files import read_bounded, write_atomically
+from shared.files import write_atomically
 from shared.plan import parse_plan_key
 from shared.policy import Policy
 from shared.store.store import Store
@@ -142,6 +145,12 @@ def newest_policy(store: Store) -> int:
     return max((parse_plan_key(job.plan_key)[1] for job in store.jobs()), default=0)
 
 
+class AlternationRecord(BaseModel):
+    """What is read again of an alternation's record."""
+
+    best: int = Field(ge=1, le=1000)
+
+
 @dataclass(frozen=True, slots=True)
 class Trained:
     """Where a training left what it made.
@@ -164,11 +173,10 @@ def trained_in(out: Path) -> Trained:
     """
     record = out / ALTERNATION_FILE
     if record.is_file():
-        try:
-            best = int(json.loads(read_bounded(record, MAX_DONE_BYTES))["best"])
-        except (ValueError, KeyError, TypeError, RecursionError):
-            raise StoreError(f"{record}: damaged; the same training again writes it anew") from None
-        policy = out / f"aip-{best}"
+        told = read_document(
+            AlternationRecord, record, MAX_DONE_BYTES, "damaged; the same training again writes it anew"
+        )
+        policy = out / f"aip-{told.best}"
     else:
         policy = out
     if not (policy / DONE_FILE).is_file():
@@ -183,11 +191,10 @@ def best_score(folder: Path) -> float:
     Raises:
         StoreError: its done.json is damaged.
     """
-    path = folder / DONE_FILE
-    try:
-        return float(json.loads(read_bounded(path, MAX_DONE_BYTES))["metrics"]["score"])
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise StoreError(f"{path}: damaged; remove the folder to train this stage again") from None
+    score = read_done(folder / DONE_FILE).metrics.get("score")
+    if score is None:
+        raise StoreError(f"{folder / DONE_FILE}: damaged; remove the folder to train this stage again")
+    return score
 
 
 def _run(

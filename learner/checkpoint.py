@@ -3,21 +3,26 @@
 One file, put in place by a rename, so that no kill can leave weights of one step beside a cursor of another.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from pydantic import Field, ValidationError
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from shared.configuration import StrictModel
+from shared.documents import problem_of
 from shared.errors import StoreError, UsageError
-from shared.files import write_atomically
-from shared.policy import check_tensors
+from shared.files import read_bounded, write_atomically
+from shared.policy import MAX_WEIGHTS_BYTES, METADATA, read_tensors, tensor_header
 
+MAX_CHECKPOINT_BYTES = 4 * MAX_WEIGHTS_BYTES
+"""Weights, best weights and two moments of each."""
+CURSOR = "cursor"
+"""Name of the metadata that hold it."""
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -47,7 +52,7 @@ def write_checkpoint(
     for number, moments in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{number}.{name}": moments[name] for name in _MOMENTS}
     whole = {name: tensor.detach().clone().contiguous() for name, tensor in tensors.items()}
-    write_atomically(path, save(whole, metadata={"cursor": cursor.model_dump_json()}))
+    write_atomically(path, save(whole, metadata={CURSOR: cursor.model_dump_json()}))
 
 
 def read_checkpoint(
@@ -61,14 +66,16 @@ def read_checkpoint(
     Raises:
         StoreError: the file is damaged, or of another network.
     """
-    cursor, tensors = _read(path)
-    state = module.state_dict()
-    current, best = _named(tensors, "module."), _named(tensors, "best.")
-    check_tensors(current, state, str(path))
-    check_tensors(best, state, str(path))
-    module.load_state_dict(current)
-    _load_optimiser(optimiser, _named(tensors, "optimiser."), str(path))
-    return cursor, best
+    state = {name: tensor.detach() for name, tensor in module.state_dict().items()}
+    with _as_checkpoint(path):
+        data = read_bounded(path, MAX_CHECKPOINT_BYTES)
+        cursor = _cursor(data)
+        moments = _moments_in(tensor_header(data, CURSOR), optimiser)
+        expected = {f"{part}.{name}": tensor for part in ("module", "best") for name, tensor in state.items()}
+        tensors = read_tensors(data, expected | {f"optimiser.{n}": tensor for n, tensor in moments.items()}, CURSOR)
+    module.load_state_dict(_named(tensors, "module."))
+    _load_optimiser(optimiser, _named(tensors, "optimiser."))
+    return cursor, _named(tensors, "best.")
 
 
 def read_cursor(path: Path) -> Cursor:
@@ -77,7 +84,8 @@ def read_cursor(path: Path) -> Cursor:
     Raises:
         StoreError: the file is damaged or foreign.
     """
-    return _read(path, tensors_too=False)[0]
+    with _as_checkpoint(path):
+        return _cursor(read_bounded(path, MAX_CHECKPOINT_BYTES))
 
 
 def check_fingerprint(cursor: Cursor, fingerprint: str, out: Path) -> None:
@@ -90,32 +98,43 @@ def check_fingerprint(cursor: Cursor, fingerprint: str, out: Path) -> None:
         raise UsageError(f"{out}: holds a run with other data or settings; choose another --out")
 
 
-def _read(path: Path, *, tensors_too: bool = True) -> tuple[Cursor, dict[str, Tensor]]:
+def _cursor(data: bytes) -> Cursor:
+    told = tensor_header(data, CURSOR).get(METADATA)
+    text = told.get(CURSOR) if isinstance(told, dict) else None
     try:
-        with safe_open(path, framework="pt") as file:
-            cursor = Cursor.model_validate_json((file.metadata() or {}).get("cursor", ""))
-            names = file.keys() if tensors_too else []
-            return cursor, {name: file.get_tensor(name) for name in names}
+        # Unlike in other documents a number may be infinite here.
+        return Cursor.model_validate_json(text if isinstance(text, str) else "")
     except ValidationError as error:
-        problem = error.errors()[0]
-        reason = f"{'.'.join(map(str, problem['loc'])) or 'cursor'}: {problem['msg']}"
-    except (SafetensorError, OSError) as error:
-        reason = str(error)
-    line = " ".join(reason.split())[:100]
-    raise StoreError(f"{path}: not a checkpoint of this version ({line}); remove it to begin this stage anew")
+        raise StoreError(f"{CURSOR}: {problem_of(error)}") from None
 
 
-def _load_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor], source: str) -> None:
+@contextmanager
+def _as_checkpoint(path: Path) -> Iterator[None]:
+    """Say of what is wrong with a checkpoint what to do about it."""
+    try:
+        yield
+    except StoreError as error:
+        line = str(error).removeprefix(f"{path}: ")[:160]
+        raise StoreError(
+            f"{path}: not a checkpoint of this version ({line}); remove it to begin this stage anew"
+        ) from None
+
+
+def _moments_in(names: Iterable[str], optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """What a checkpoint's moments must look like, by number of the parameter and name."""
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
-    numbers = {name.split(".")[0] for name in tensors}
     # A parameter that no gradient has reached yet has no moments.
-    expected = {
-        f"{number}.{name}": torch.zeros(()) if name == "step" else parameter
+    numbers = {name.split(".")[1] for name in names if name.startswith("optimiser.")}
+    return {
+        f"{number}.{name}": torch.zeros(()) if name == "step" else parameter.detach()
         for number, parameter in enumerate(parameters)
         for name in _MOMENTS
         if str(number) in numbers
     }
-    check_tensors(tensors, expected, source)
+
+
+def _load_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    numbers = {name.split(".")[0] for name in tensors}
     state: dict[int, dict[str, Any]] = {
         int(number): {name: tensors[f"{number}.{name}"] for name in _MOMENTS} for number in numbers
     }

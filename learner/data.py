@@ -16,8 +16,8 @@ from torch import Tensor
 
 from learner.facts import HiddenColumns, facts_of
 from learner.hardware import moved
-from shared.configuration import MAX_CONFIGURATION_BYTES
 from shared.errors import StoreError, UsageError
+from shared.files import read_named
 from shared.geometry import view_from_world
 from shared.grouping import Grouping, group_cloud
 from shared.networks.actions import middle_of
@@ -33,6 +33,7 @@ COLUMNS = (
     *("point_index", "rotation", "order", "role", "policy_version", "method", "budget", "target_part"),
     *("joint_positions", "joint_limits", "joint_twist", "outcome", "motion", "success"),
 )
+MAX_LIST_BYTES = 1 << 20
 VALIDATION_SHARE = 5
 """Without lists of objects, one object in this many is kept for validation, chosen by a hash of its id."""
 
@@ -206,12 +207,12 @@ def read_object_list(path: Path | None) -> frozenset[str] | None:
     """
     if path is None:
         return None
+    advice = "name a text file with one object id a line"
     try:
-        if path.stat().st_size > MAX_CONFIGURATION_BYTES:
-            raise UsageError(f"{path}: larger than {MAX_CONFIGURATION_BYTES} bytes; not a list of objects")
-        names = frozenset(line.split()[0] for line in path.read_text(encoding="utf-8-sig").splitlines() if line.split())
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: cannot be read ({error}); name a text file with one object id a line") from None
+        lines = read_named(path, MAX_LIST_BYTES, advice).decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise UsageError(f"{path}: not text; {advice}") from None
+    names = frozenset(line.split()[0] for line in lines if line.split())
     if not names:
         raise UsageError(f"{path}: lists no object; write one object id a line")
     return names
@@ -256,6 +257,10 @@ def _rows(
         view=view,
         middle=middles.double().numpy()[cloud],
     )
+    numbers = [cells["motion"], rotation, cells["joint_twist"]]
+    facts = facts_of(hidden).astype(np.float32)
+    if not all(np.isfinite(each.astype(np.float32)).all() for each in (*numbers, facts)):
+        raise StoreError("the store holds numbers that are not finite; run `adaafford store verify`")
     return Rows(
         cloud=torch.from_numpy(cloud),
         point=torch.from_numpy(point),
@@ -265,7 +270,7 @@ def _rows(
         success=torch.from_numpy(cells["success"].astype(np.float32)),
         step=torch.from_numpy(cells["step"].astype(np.int64)),
         continued=torch.from_numpy(np.array(cells["order"]) == Order.CONTINUE.value),
-        facts=torch.from_numpy(facts_of(hidden).astype(np.float32)),
+        facts=torch.from_numpy(facts),
         role=np.array(cells["role"]),
         method=np.array(cells["method"]),
         budget=cells["budget"].astype(np.int64),

@@ -14,19 +14,21 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import ValidationError
+from pydantic import Field, RootModel
 
 from learner import sharing
 from learner.data import kept_for_validation
 from learner.names import PUBLISHED_FILE
 from learner.stages import StageJob
-from shared.errors import StoreError, UsageError
+from shared.documents import read_document
+from shared.errors import StoreError
 from shared.files import read_bounded, write_atomically
 from shared.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
 from shared.store.layout import MAX_DOCUMENT_BYTES, SHARDS_FOLDER, STORE_FILE, parse_shard_id
 from shared.store.place import place_of
-from shared.store.policies import version_of
+from shared.store.policies import MAX_VERSION, version_of
 from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
@@ -132,6 +134,10 @@ class Following:
         return sum(job.stop - job.start for job in jobs if job is not None)
 
 
+class Published(RootModel[dict[str, Annotated[int, Field(ge=1, le=MAX_VERSION)]]]):
+    """The versions of the policies that a learner has published, by what it calls them."""
+
+
 def publish(store: Store, out: Path, name: str, policy: Path) -> int | None:
     """Put a policy into the store under the next free version, once; returns that version, in the first process.
 
@@ -175,15 +181,10 @@ def _published(out: Path) -> dict[str, int]:
     path = out / PUBLISHED_FILE
     if not path.exists():
         return {}
-    try:
-        told = json.loads(read_bounded(path, MAX_DOCUMENT_BYTES))
-        return {str(name): int(version) for name, version in told.items()}
-    except (ValueError, AttributeError, TypeError, RecursionError):
-        raise StoreError(f"{path}: damaged; restore it, or choose another --out") from None
+    return read_document(Published, path, MAX_DOCUMENT_BYTES, "damaged; restore it, or choose another --out").root
 
 
 def _read_snapshot(path: Path) -> Snapshot:
-    try:
-        return Snapshot.model_validate_json(read_bounded(path, MAX_DOCUMENT_BYTES))
-    except ValidationError:
-        raise UsageError(f"{path}: damaged; remove it to learn from what the store holds now") from None
+    return read_document(
+        Snapshot, path, MAX_DOCUMENT_BYTES, "damaged; remove it to learn from what the store holds now"
+    )

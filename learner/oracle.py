@@ -15,7 +15,7 @@ from learner.sampling import Batch
 from shared.files import read_bounded
 from shared.networks.aap import Aap, OracleEncoder
 from shared.networks.configuration import NetworkConfig
-from shared.policy import MAX_WEIGHTS_BYTES, check_tensors, read_tensors
+from shared.policy import MAX_WEIGHTS_BYTES, read_tensors
 
 
 class OracleCritic(nn.Module):
@@ -69,9 +69,8 @@ def read_oracle(path: Path, config: NetworkConfig) -> OracleCritic:
     Raises:
         StoreError: the file is damaged, foreign, or of networks of another size.
     """
-    tensors = read_tensors(read_bounded(path, MAX_WEIGHTS_BYTES), str(path))
     with torch.device("meta"):
         oracle = OracleCritic(Aap(config))
-    check_tensors(tensors, oracle.state_dict(), str(path))
+    tensors = read_tensors(read_bounded(path, MAX_WEIGHTS_BYTES), oracle.state_dict(), str(path))
     oracle.load_state_dict(tensors, assign=True)
     return oracle.eval().requires_grad_(False)

@@ -20,6 +20,8 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pydantic import BaseModel, Field
+
 from learner import sharing
 from learner.checkpoint import check_fingerprint, read_cursor
 from learner.configuration import LearnerConfig
@@ -30,7 +32,8 @@ from learner.names import METRICS_FILE
 from learner.oracle import read_oracle
 from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FILE, ORACLE_FOLDER, Recipe, Runner
 from learner.training import CHECKPOINT_FILE, TrainingResult, without_nan
-from shared.errors import StoreError, UsageError
+from shared.documents import read_document
+from shared.errors import UsageError
 from shared.files import exclusive_lock, read_bounded, write_atomically
 from shared.methods import ModuleName
 from shared.networks.configuration import NetworkConfig
@@ -220,11 +223,24 @@ def objects_seen(folder: Path) -> frozenset[str]:
     path = folder / DONE_FILE
     if not path.is_file():
         return frozenset()
-    try:
-        found = json.loads(read_bounded(path, MAX_DONE_BYTES)).get("objects", [])
-        return frozenset(str(name) for name in found)
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        raise StoreError(f"{path}: damaged; remove the folder to train this stage again") from None
+    return frozenset(read_done(path).objects)
+
+
+class Done(BaseModel):
+    """What is read again of done.json; of a policy that a run adopted only the objects are known."""
+
+    fingerprint: str = ""
+    objects: tuple[str, ...] = ()
+    metrics: dict[str, float | None] = Field(default_factory=dict)
+
+
+def read_done(path: Path) -> Done:
+    """What done.json says.
+
+    Raises:
+        StoreError: it is damaged.
+    """
+    return read_document(Done, path, MAX_DONE_BYTES, "damaged; remove the folder to train this stage again")
 
 
 def _say(line: str) -> None:
@@ -298,9 +314,5 @@ def _check_checkpoints(out: Path, fingerprint: str) -> None:
 
 
 def _check_done(path: Path, fingerprint: str) -> None:
-    try:
-        found = json.loads(read_bounded(path, MAX_DONE_BYTES))["fingerprint"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        found = None
-    if found != fingerprint:
+    if read_done(path).fingerprint != fingerprint:
         raise UsageError(f"{path.parent}: holds a finished run with other data or settings; choose another --out")

@@ -25,9 +25,11 @@ from learner.hardware import Hardware
 from learner.names import METRICS_FILE
 from learner.progress import ProgressReport, Standing
 from shared.errors import UsageError
+from shared.files import read_bounded
 from shared.seeds import generator
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
+MAX_METRICS_BYTES = 1 << 26
 WARMING = 0.1
 """Share of the steps in which the learning rate grows, where it follows a cosine."""
 
@@ -254,8 +256,9 @@ class _Loop:
         path = self.out / METRICS_FILE
         if not path.exists():
             return
-        kept = [line for line in map(_parsed, path.read_text(encoding="utf-8").splitlines()) if line is not None]
-        text = "".join(json.dumps(line) + "\n" for line in kept if line.get("step", 0) <= step)
+        lines = read_bounded(path, MAX_METRICS_BYTES).decode(errors="replace").splitlines()
+        kept = [line for line in map(_parsed, lines) if line is not None]
+        text = "".join(json.dumps(line) + "\n" for line in kept if line["step"] <= step)
         temporary = path.with_suffix(".tmp")
         temporary.write_text(text, encoding="utf-8")
         temporary.replace(path)
@@ -281,6 +284,6 @@ def without_nan(values: Mapping[str, Any]) -> dict[str, Any]:
 def _parsed(line: str) -> dict[str, Any] | None:
     try:
         parsed = json.loads(line)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         return None
-    return parsed if isinstance(parsed, dict) else None
+    return parsed if isinstance(parsed, dict) and isinstance(parsed.setdefault("step", 0), int | float) else None

@@ -7,10 +7,14 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from shared.documents import MAX_PROBLEMS, MAX_WORD, printable
 from shared.errors import UsageError
+from shared.files import read_named
 from shared.vocabulary import Order, Primitive
 
-MAX_CONFIGURATION_BYTES = 1 << 20
+MAX_CONFIGURATION_BYTES = 1 << 18
+MAX_DOTS = 100
+"""In a line of a configuration file, paths included."""
 
 Collision = Literal["hulls", "decomposed"]
 
@@ -202,14 +206,15 @@ def load_toml(path: Path) -> dict[str, Any]:
     Raises:
         UsageError: the file is missing, too large, or not TOML.
     """
+    data = read_named(path, MAX_CONFIGURATION_BYTES, "name an existing TOML file")
     try:
-        if path.stat().st_size > MAX_CONFIGURATION_BYTES:
-            raise UsageError(f"{path}: larger than {MAX_CONFIGURATION_BYTES} bytes; not a configuration file")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read ({error.strerror}); name an existing TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: not valid TOML ({error})") from None
+        text = data.decode("utf-8")
+        # The parser's work grows with the square of the number of dots in a key.
+        if any(line.count(".") > MAX_DOTS for line in text.splitlines()):
+            raise ValueError(f"a line with more than {MAX_DOTS} dots")
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path}: not valid TOML ({printable(str(error), 200)}); correct it") from None
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -223,17 +228,27 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
     """One line for the first thing that is wrong, with the likely spelling of an unknown setting."""
+    if error.error_count() > MAX_PROBLEMS:
+        return f"{error.error_count()} settings are unknown or not allowed"
     problems = error.errors()
     problem = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
     location = [str(part) for part in problem["loc"]]
-    name = ".".join(location) or "the file"
+    name = printable(".".join(location)) or "the file"
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     if problem["type"] == "extra_forbidden":
         known = sorted(_fields_at(model, location[:-1]))
-        close = difflib.get_close_matches(location[-1], known, n=1)
+        close = difflib.get_close_matches(location[-1][:MAX_WORD], known, n=1)
         hint = f"did you mean '{close[0]}'?" if close else f"allowed here: {', '.join(known)}"
         return f"unknown setting '{name}'; {hint}{more}"
-    return f"setting '{name}': {problem['msg']}; given {str(problem['input'])[:80]!r}{more}"
+    return f"setting '{name}': {problem['msg']}; given {_shown(problem['input'])}{more}"
+
+
+def _shown(value: object) -> str:
+    """A value as a message has it; an integer of thousands of digits cannot be written."""
+    try:
+        return repr(printable(str(value)))
+    except (ValueError, RecursionError):
+        return f"a value of type {type(value).__name__}"
 
 
 def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:

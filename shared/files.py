@@ -147,22 +147,15 @@ def read_bounded(path: Path, limit: int) -> bytes:
         UnreadableError: the system refuses to read it.
     """
     try:
-        # A pipe in place of a file would block for ever, and a link could lead anywhere.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-        try:
-            found = os.fstat(descriptor)
-            regular = stat.S_ISREG(found.st_mode)
-            # No larger pieces than the file needs: as much memory is taken as is asked for.
-            data = _read_all(descriptor, limit + 1, min(found.st_size + 1, 1 << 24)) if regular else b""
-        finally:
-            os.close(descriptor)
+        # A link could lead anywhere.
+        data = _read_regular(path, limit, os.O_NOFOLLOW)
     except (FileNotFoundError, NotADirectoryError):
         raise MissingError(f"{path}: cannot be read (it is missing); restore the file from a copy") from None
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.ENXIO):
             raise StoreError(f"{path}: cannot be read ({error.strerror}); restore the file from a copy") from None
         raise unreadable(path, error) from None
-    if not regular:
+    if data is None:
         raise StoreError(f"{path}: not a regular file; restore it from a copy")
     if len(data) > limit:
         raise StoreError(f"{path}: larger than the {limit} bytes that it may have; the file is foreign or damaged")
@@ -177,6 +170,42 @@ def unreadable(path: Path, error: OSError) -> UnreadableError:
         else "check the disk or the network, then repeat the command"
     )
     return UnreadableError(f"{path}: cannot be read ({error.strerror or error}); {advice}")
+
+
+def read_named(path: Path, limit: int, advice: str) -> bytes:
+    """The bytes of a regular file that a user names, and that links may lead to.
+
+    Args:
+        path: the file.
+        limit: the most bytes that it may have.
+        advice: what a message tells the user to do.
+
+    Raises:
+        UsageError: it is missing, no regular file (a pipe, say), or larger.
+    """
+    try:
+        data = _read_regular(path, limit, 0)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); {advice}") from None
+    if data is None:
+        raise UsageError(f"{path}: not a regular file; {advice}")
+    if len(data) > limit:
+        raise UsageError(f"{path}: larger than {limit} bytes; {advice}")
+    return data
+
+
+def _read_regular(path: Path, limit: int, flags: int) -> bytes | None:
+    """At most one byte more than `limit`; None of what is no regular file, which could be endless."""
+    # To open a pipe would wait for a writer.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | flags)
+    try:
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode):
+            return None
+        # No larger pieces than the file needs: as much memory is taken as is asked for.
+        return _read_all(descriptor, limit + 1, min(found.st_size + 1, 1 << 24))
+    finally:
+        os.close(descriptor)
 
 
 def _read_all(descriptor: int, limit: int, most: int) -> bytes:

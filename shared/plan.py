@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import FailFast, Field
 
 from shared.configuration import CollectionConfig, StrictModel
 from shared.methods import MethodName
@@ -55,7 +55,7 @@ class Setting(StrictModel):
     kind: Literal["collection", "evaluation"] = "collection"
     task: str
     seed: int = Field(ge=0)
-    objects: tuple[ObjectRef, ...] = Field(min_length=1)
+    objects: Annotated[tuple[ObjectRef, ...], FailFast(), Field(min_length=1)]
     collection: CollectionConfig
     evaluation: EvaluationConfig | None = None
 

@@ -2,15 +2,16 @@
 
 import hashlib
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-from pydantic import Field, ValidationError
+from pydantic import Field
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from shared.configuration import StrictModel
+from shared.documents import parse_document, parse_object, printable
 from shared.errors import StoreError, UsageError
 from shared.methods import BaselineName, ModuleName
 from shared.networks.aap import Aap
@@ -24,7 +25,13 @@ WEIGHTS_FILE = "weights.safetensors"
 POLICY_FILE = "policy.json"
 POLICY_SCHEMA = 1
 MAX_POLICY_JSON_BYTES = 1 << 16
-MAX_WEIGHTS_BYTES = 1 << 30
+MAX_WEIGHTS_BYTES = 1 << 28
+MAX_HEADER_BYTES = 1 << 22
+"""Of a file of tensors; each has a hundred bytes in it."""
+MAX_PARAMETERS = 1 << 26
+METADATA = "__metadata__"
+"""Of a file of tensors: texts by name."""
+_KINDS = {torch.float32: "F32", torch.float16: "F16", torch.int64: "I64"}
 
 
 class PolicyDocument(StrictModel):
@@ -150,47 +157,55 @@ class Policy:
             raise StoreError(f"policy: {WEIGHTS_FILE} is missing or larger than {MAX_WEIGHTS_BYTES} bytes")
         if hashlib.sha256(weights).hexdigest() != document.weights_sha256:
             raise StoreError(f"policy: the SHA-256 of {WEIGHTS_FILE} is not that of {POLICY_FILE}; publish it again")
-        tensors = _widened(read_tensors(weights, WEIGHTS_FILE))
         # On the meta device nothing is allocated, so that absurd sizes cost nothing before they are refused.
         with torch.device("meta"):
             policy = cls(document.task, document.network, frozenset(document.trained))
         modules = policy.modules()
-        check_tensors(tensors, modules.state_dict(), WEIGHTS_FILE)
+        parameters = sum(tensor.numel() for tensor in modules.state_dict().values())
+        if parameters > MAX_PARAMETERS:
+            raise StoreError(f"policy: {POLICY_FILE} asks for {parameters} weights; allowed: {MAX_PARAMETERS}")
+        tensors = read_tensors(weights, modules.state_dict(), WEIGHTS_FILE)
         modules.load_state_dict(tensors, assign=True)
         modules.eval().requires_grad_(False)
         return policy
 
 
-def read_tensors(data: bytes, source: str) -> dict[str, Tensor]:
-    """Tensors from hostile safetensors bytes.
+def read_tensors(data: bytes, expected: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+    """Tensors from hostile safetensors bytes, of the names, shapes and types of `expected`, and of finite numbers.
+
+    Those that were kept in half precision come in full precision.
 
     Raises:
-        StoreError: truncated or foreign.
+        StoreError: truncated or foreign, or with the first tensor that differs.
     """
-    try:
-        return load(data)
-    except (SafetensorError, ValueError, KeyError) as error:
-        line = " ".join(str(error).split())[:100]
-        raise StoreError(f"{source}: not readable as safetensors ({line}); the file is damaged or foreign") from None
-
-
-def check_tensors(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], source: str) -> None:
-    """Hold tensors to the names, shapes and types of `expected`, and to finite numbers.
-
-    Raises:
-        StoreError: with the first that differs.
-    """
-    odd = sorted(tensors.keys() ^ expected.keys())
+    header = tensor_header(data, source)
+    odd = sorted((header.keys() - {METADATA}) ^ expected.keys())
     if odd:
         state = "missing" if odd[0] in expected else "unknown"
-        raise StoreError(f"{source}: tensor {odd[0][:80]!r} is {state}; the weights are of another network")
-    for name, tensor in tensors.items():
-        want = expected[name]
-        if tensor.shape != want.shape or tensor.dtype != want.dtype:
-            given = f"{tensor.dtype} {tuple(tensor.shape)}"
+        raise StoreError(f"{source}: tensor '{printable(odd[0])}' is {state}; the weights are of another network")
+    for name, want in expected.items():
+        entry = header[name] if isinstance(header[name], dict) else {}
+        kinds = (_KINDS[want.dtype], "F16") if want.is_floating_point() else (_KINDS[want.dtype],)
+        if entry.get("dtype") not in kinds or entry.get("shape") != list(want.shape):
+            given = printable(f"{entry.get('dtype')} {entry.get('shape')}")
             raise StoreError(f"{source}: tensor '{name}' is {given}, needs {want.dtype} {tuple(want.shape)}")
+    try:
+        tensors = _widened(load(data))
+    except (SafetensorError, ValueError, RuntimeError) as error:
+        line = printable(" ".join(str(error).split()), 100)
+        raise StoreError(f"{source}: not readable as safetensors ({line}); the file is damaged or foreign") from None
+    for name, tensor in tensors.items():
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise StoreError(f"{source}: tensor '{name}' holds numbers that are not finite; train again")
+    return tensors
+
+
+def tensor_header(data: bytes, source: str) -> dict[str, Any]:
+    """What a safetensors file says of its tensors, which nobody has checked; raises as `read_tensors` does."""
+    length = int.from_bytes(data[:8], "little")
+    if len(data) < 8 or length > min(MAX_HEADER_BYTES, len(data) - 8):
+        raise StoreError(f"{source}: not readable as safetensors (header of {length} bytes); it is damaged or foreign")
+    return parse_object(data[8 : 8 + length], source, unique=True)
 
 
 def _halved(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -210,13 +225,8 @@ def _widened(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _parse_document(data: bytes | None) -> PolicyDocument:
     if data is None or len(data) > MAX_POLICY_JSON_BYTES:
         raise StoreError(f"policy: {POLICY_FILE} is missing or larger than {MAX_POLICY_JSON_BYTES} bytes")
-    try:
-        document = PolicyDocument.model_validate_json(data)
-    except ValidationError as error:
-        problem = error.errors()[0]
-        place = ".".join(map(str, problem["loc"])) or "the file"
-        raise StoreError(f"policy: {POLICY_FILE}: {place}: {problem['msg'][:100]}; it is damaged or foreign") from None
+    document = parse_document(PolicyDocument, data, f"policy: {POLICY_FILE}", "it is damaged or foreign")
     if document.schema_version != POLICY_SCHEMA:
-        given = document.schema_version
+        given = str(document.schema_version)[:20]
         raise StoreError(f"policy: schema version {given}; this version reads {POLICY_SCHEMA}: publish it again")
     return document

@@ -1,5 +1,6 @@
 """Configuration: defaults under a preset under a file under flags; a run's folder keeps to one."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -101,3 +102,31 @@ def test_a_damaged_configuration_is_one_line(tmp_path: Path) -> None:
     run.config.write_text('{"config": {"sed": 1}}')
     with pytest.raises(UsageError, match="unknown setting 'sed'; did you mean 'seed'"):
         find(run.path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "seed = " + "[" * 20_000,
+        "a." * 20_000 + "b = 1",
+        "seed = " + "9" * 10_000,
+        "seed = 0x" + "f" * 10_000,
+        "seed = 1\nseed = 2",
+        "seed = nan",
+        "\n".join(f"a{k} = 1" for k in range(5000)),
+        '"a\\u001b[2J" = 1',
+        "x = {a = " * 2000,
+    ],
+)
+def test_a_hostile_file_of_settings_is_refused_with_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(UsageError, match=r"mine\.toml") as caught:
+        layered(CampaignConfig, None, tmp_path / "mine.toml")
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 1000
+
+
+def test_a_pipe_of_settings_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "mine.toml")
+    with pytest.raises(UsageError, match="not a regular file"):
+        layered(CampaignConfig, None, tmp_path / "mine.toml")

@@ -148,3 +148,27 @@ def test_rounding_normals_twice_changes_nothing(values: list[float]) -> None:
     assert normals.dtype == np.float32
     assert np.array_equal(unpack_normals(pack_normals(normals)), normals)
     assert np.abs(normals - np.array(values)).max() <= 0.5 / 127 + 1e-6
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device", "loop", "missing", "large"])
+def test_what_a_user_names_and_is_no_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "named"
+    match kind:
+        case "pipe":
+            os.mkfifo(path)
+        case "folder":
+            path.mkdir()
+        case "device":
+            path.symlink_to("/dev/zero")
+        case "loop":
+            path.symlink_to("named")
+        case "large":
+            path.write_bytes(bytes(11))
+    with pytest.raises(UsageError, match=r"named: .*; name another"):
+        files.read_named(path, 10, "name another")
+
+
+def test_a_link_that_a_user_names_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    (tmp_path / "b").symlink_to("a")
+    assert files.read_named(tmp_path / "b", 3, "") == b"abc"

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -89,12 +89,14 @@ def generated(folder: Path, counts: dict[str, int]) -> list[Path]:
     return sorted(path for path in (folder / "objects").iterdir() if path.is_dir())
 
 
-def assert_harmless(scratch: Path, objects: list[Path], numbers: range) -> Counter[str]:
+def assert_harmless(
+    scratch: Path, subjects: Sequence[Path | str], numbers: range, module: str = "tests.hostile_batch"
+) -> Counter[str]:
     """Try mutants in a child process, and go on after any that ends it; returns how many were refused or survived."""
     results, problems, start = Counter[str](), [], numbers.start
     while start < numbers.stop:
         under_way = f"{start} (at the start)"
-        batch = Batch(scratch / f"from-{start}", objects, start, numbers.stop)
+        batch = Batch(scratch / f"from-{start}", module, subjects, start, numbers.stop)
         for line in batch.lines():
             word, number, rest = line.split(" ", 2)
             start = int(number) + 1
@@ -117,11 +119,11 @@ def assert_harmless(scratch: Path, objects: list[Path], numbers: range) -> Count
 class Batch:
     """A child process that tries mutants, ended when it says nothing for too long."""
 
-    def __init__(self, scratch: Path, objects: list[Path], start: int, stop: int) -> None:
+    def __init__(self, scratch: Path, module: str, subjects: Sequence[Path | str], start: int, stop: int) -> None:
         scratch.mkdir()
-        arguments = [str(scratch), str(SEED), str(start), str(stop), *map(str, objects)]
+        arguments = [str(scratch), str(SEED), str(start), str(stop), *map(str, subjects)]
         self._child = subprocess.Popen(
-            [sys.executable, "-m", "tests.hostile_batch", *arguments],
+            [sys.executable, "-m", module, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,

@@ -103,7 +103,7 @@ def test_an_absurdly_large_network_is_refused_without_being_built(files: dict[st
     wide = (2048,) * 8
     network = NetworkConfig(abstraction=(wide,) * 3, propagation=(wide, wide, (*wide[1:], 128)))
     changes = {"network": network.model_dump(mode="json")}
-    with pytest.raises(StoreError, match="another network"):
+    with pytest.raises(StoreError, match=r"asks for \d+ weights"):
         Policy.from_files(resealed(files, files[WEIGHTS_FILE], **changes))
 
 
@@ -131,3 +131,45 @@ def test_weights_that_half_precision_cannot_hold_are_not_exported_in_it(files: d
     policy.aap.empty_latent[0] = 1e6
     with pytest.raises(UsageError, match="do not fit into half precision"):
         policy.to_files(half=True)
+
+
+def test_networks_that_would_take_gigabytes_a_cloud_are_refused(files: dict[str, bytes]) -> None:
+    network = NetworkConfig().model_dump(mode="json")
+    network |= {"centres": [2048, 128, 32], "neighbours": 128, "abstraction": [[2048], [64], [128]]}
+    with pytest.raises(StoreError, match="choose fewer"):
+        Policy.from_files(resealed(files, files[WEIGHTS_FILE], network=network))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"shape": [2**32, 2**32]},
+        {"shape": [0, 2**63]},
+        {"shape": [2**64, 0]},
+        {"shape": "x"},
+        {"dtype": "F4"},
+        {"data_offsets": [0, 2**63]},
+        {"data_offsets": [-1, 4]},
+        {"data_offsets": [8, 4]},
+        {"data_offsets": [0, 0]},
+    ],
+)
+def test_tensors_that_are_not_where_or_what_they_must_be_are_refused(
+    files: dict[str, bytes], changes: dict[str, object]
+) -> None:
+    data = files[WEIGHTS_FILE]
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    next(entry for name, entry in sorted(header.items()) if name != "__metadata__").update(changes)
+    forged = json.dumps(header).encode()
+    with pytest.raises(StoreError, match=r"tensor|safetensors"):
+        Policy.from_files(resealed(files, len(forged).to_bytes(8, "little") + forged + data[8 + length :]))
+
+
+def test_a_header_of_many_megabytes_is_refused_before_it_is_read(files: dict[str, bytes]) -> None:
+    data = files[WEIGHTS_FILE]
+    length = int.from_bytes(data[:8], "little")
+    blanks = 5 << 20
+    padded = (length + blanks).to_bytes(8, "little") + data[8 : 8 + length] + b" " * blanks + data[8 + length :]
+    with pytest.raises(StoreError, match="header of"):
+        Policy.from_files(resealed(files, padded))

@@ -12,11 +12,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from numcodecs.blosc import Blosc
 
+from learner.data import load_dataset
+from shared.documents import MAX_VALUES, parse_object
 from shared.errors import StoreError
+from shared.networks.configuration import NetworkConfig
 from shared.plan import Job, Plan
 from shared.store import Store, info, verify
+from shared.store.columns import INTERACTION_COLUMNS, MAX_JOINT_NAMES, MAX_TEXT
+from shared.store.observations import ARRAYS
+from shared.store.repair import repair
 from shared.store.sealed import canonical, seal, unseal
+from shared.store.tables import read_table
 from tests.fabricate import fabricate_rollouts, fabricate_setting
 
 SETTING = fabricate_setting()
@@ -57,6 +65,15 @@ def forge(shard: Path, contents: dict[str, bytes], **changes: Any) -> None:
         (shard / name).write_bytes(data)
         manifest["files"][name] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     (shard / "manifest.json").write_bytes(seal(manifest | changes))
+
+
+def packed(table: Any, **options: Any) -> bytes:
+    """A Parquet file of the kinds of pages that the store writes, unless the options say otherwise."""
+    texts = [field.name for field in table.schema if field.type == pa.string()]
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, **({"use_dictionary": texts, "compression": "zstd"} | options))
+    data: bytes = sink.getvalue().to_pybytes()
+    return data
 
 
 def refused(act: Callable[[], object], message: str) -> None:
@@ -147,9 +164,9 @@ def test_data_swapped_for_other_valid_data_is_found_by_the_digest(store: Store, 
     table = pq.read_table(shard / "interactions.parquet")
     flipped = [not success for success in table.column("success").to_pylist()]
     index = table.schema.get_field_index("success")
-    sink = pa.BufferOutputStream()
-    pq.write_table(table.set_column(index, table.schema.field(index), pa.array(flipped)), sink)
-    forge(shard, {"interactions.parquet": sink.getvalue().to_pybytes()})
+    forge(
+        shard, {"interactions.parquet": packed(table.set_column(index, table.schema.field(index), pa.array(flipped)))}
+    )
     assert any("not the one whose digest" in problem.what for problem in verify(store))
 
 
@@ -158,33 +175,40 @@ def test_a_frame_that_disagrees_is_found(store: Store, shard: Path) -> None:
     for name in ("rotation_camera", "joint_friction", "object_category"):
         index = table.schema.get_field_index(name)
         column = table.column(index).take(pa.array([0] * len(table)))
-        sink = pa.BufferOutputStream()
-        pq.write_table(table.set_column(index, table.schema.field(index), column), sink)
-        forge(shard, {"interactions.parquet": sink.getvalue().to_pybytes()})
+        forge(shard, {"interactions.parquet": packed(table.set_column(index, table.schema.field(index), column))})
         assert any(f"column {name} does not agree" in problem.what for problem in verify(store))
 
 
-def changed(shard: Path, name: str, value: Any) -> bytes:
-    """interactions.parquet with every cell of a column replaced."""
-    table = pq.read_table(shard / "interactions.parquet")
+def changed(shard: Path, name: str, value: Any, file: str = "interactions.parquet") -> bytes:
+    """A table with every cell of a column replaced."""
+    table = pq.read_table(shard / file)
     index = table.schema.get_field_index(name)
     field = table.schema.field(index)
-    sink = pa.BufferOutputStream()
-    pq.write_table(table.set_column(index, field, pa.array([value] * len(table), field.type)), sink)
-    data: bytes = sink.getvalue().to_pybytes()
-    return data
+    return packed(table.set_column(index, field, pa.array([value] * len(table), field.type)))
 
 
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("point", [float("nan")] * 3, "point holds a number that is not finite"),
+        ("point", [float("nan")] * 3, "column point holds a number that is not finite"),
         ("motion", float("inf"), "not finite"),
+        ("motion", float("nan"), "not finite"),
+        ("motion", -1.0, "motion is -1.0"),
+        ("part_mass", float("nan"), "not finite"),
+        ("joint_limits", [float("-inf")] * 2, "not finite"),
         ("rollout_observation", 7, "refers to observation 7 of 1"),
-        ("point_index", -1, "refers to point -1"),
+        ("observation", 2**31 - 1, "column observation goes from 2147483647"),
+        ("point_index", -1, "column point_index goes from -1"),
         ("target_part", 200, "target part 200"),
-        ("outcome", "splendid", "'splendid' is not a valid OutcomeKind"),
+        ("target_part", 2**31 - 1, "column target_part goes from"),
+        ("outcome", "splendid", "column outcome holds 'splendid'"),
+        ("order", "", "column order holds ''"),
         ("target_link", "x" * 1000, "text of 1000 characters"),
+        ("object_id", "x" * 3_000_000, "text of 3000000 characters|unpacks to more than"),
+        ("proposer", "a\x1b[2Jb", "'a.\\[2Jb'"),
+        ("joint_names", "[" * 20_000, "not a record|recursion"),
+        ("joint_names", '{"a": 1}', "joint_names is no list of names"),
+        ("joint_names", "[[]]", "joint_names is no list of names"),
         ("step", 0, "steps must grow"),
     ],
 )
@@ -195,18 +219,15 @@ def test_rows_that_are_no_records_are_refused(store: Store, shard: Path, name: s
 
 
 def test_tables_of_other_columns_are_refused(store: Store, shard: Path) -> None:
-    sink = pa.BufferOutputStream()
-    pq.write_table(pq.read_table(shard / "interactions.parquet").drop_columns(["motion"]), sink)
-    forge(shard, {"interactions.parquet": sink.getvalue().to_pybytes()})
+    table = pq.read_table(shard / "interactions.parquet").drop_columns(["motion"])
+    forge(shard, {"interactions.parquet": packed(table)})
     refused(store.interactions, "has other columns")
     forge(shard, {"interactions.parquet": b"PAR1 but not really PAR1"})
     refused(lambda: info(store), "cannot be decoded")
 
 
 def test_tables_of_other_length_are_refused(store: Store, shard: Path) -> None:
-    sink = pa.BufferOutputStream()
-    pq.write_table(pq.read_table(shard / "interactions.parquet").slice(0, 3), sink)
-    forge(shard, {"interactions.parquet": sink.getvalue().to_pybytes()})
+    forge(shard, {"interactions.parquet": packed(pq.read_table(shard / "interactions.parquet").slice(0, 3))})
     refused(store.interactions, "the manifest says 16 rows")
 
 
@@ -270,6 +291,124 @@ def test_chunks_that_would_unpack_to_gigabytes_are_refused(store: Store, shard: 
     data[4:8] = (2**31 - 1).to_bytes(4, "little")
     forge(shard, {name: bytes(data)})
     refused(lambda: store.read_observations(shard.name), "claims another size")
+
+
+@pytest.mark.parametrize("size", [0, 15, 16, 17, 2**20, 2**31 - 1, 2**32 - 1])
+@pytest.mark.parametrize("name", ["points/c.0.0.0", "movable/c.0.0", "world_from_camera/c.0.0.0"])
+def test_chunks_that_claim_another_packed_size_are_refused(store: Store, shard: Path, name: str, size: int) -> None:
+    data = (shard / CLOUDS / name).read_bytes()
+    forge(shard, {f"{CLOUDS}/{name}": data[:12] + size.to_bytes(4, "little") + data[16:]})
+    refused(lambda: store.read_observations(shard.name), "claims another size")
+    repair(store.path)
+    assert verify(store) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "number", "message"),
+    [
+        ("points", 1, 0x7C00, "not finite"),
+        ("world_from_camera", 0, 0x7FF0000000000000, "not finite"),
+        ("world_from_camera", 0, 0x4010000000000000, "no pose of a camera"),
+        ("movable", 3, 7, "neither true nor false"),
+    ],
+)
+def test_clouds_that_are_none_are_refused(
+    store: Store, shard: Path, name: str, place: int, number: int, message: str
+) -> None:
+    (file,) = (shard / CLOUDS / name).glob("c.*")
+    kept = next(kind.kept for kind in ARRAYS if kind.name == name)
+    numbers = np.frombuffer(Blosc().decode(file.read_bytes()), f"<u{np.dtype(kept).itemsize}").copy()
+    numbers[place] = number
+    forge(shard, {str(file.relative_to(shard)): Blosc(cname="zstd").encode(numbers)})
+    refused(lambda: store.read_observations(shard.name), message)
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        {"zarr_format": 3, "node_type": "array"},
+        {"zarr_format": 3, "node_type": "group", "consolidated_metadata": {"metadata": {"points": {"shape": [2**60]}}}},
+    ],
+)
+def test_a_group_that_says_more_than_a_plain_one_is_refused(store: Store, shard: Path, metadata: Any) -> None:
+    forge(shard, {f"{CLOUDS}/zarr.json": json.dumps(metadata).encode()})
+    refused(lambda: store.read_observations(shard.name), "not a plain group's")
+    forge(shard, {f"{CLOUDS}/zarr.json": b"[" * 50_000})
+    refused(lambda: store.read_observations(shard.name), "not valid JSON")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"use_dictionary": True}, "has a page in encoding"),
+        ({"use_dictionary": False, "column_encoding": {"step": "DELTA_BINARY_PACKED"}}, "has a page in encoding 5"),
+        ({"use_dictionary": False, "column_encoding": {"motion": "BYTE_STREAM_SPLIT"}}, "has a page in encoding 9"),
+        ({"compression": "brotli"}, "in BROTLI"),
+        ({"row_group_size": 3}, "the manifest says 16 rows"),
+    ],
+)
+def test_pages_whose_size_no_header_tells_are_refused(
+    store: Store, shard: Path, options: dict[str, Any], message: str
+) -> None:
+    forge(shard, {"interactions.parquet": packed(pq.read_table(shard / "interactions.parquet"), **options)})
+    refused(store.interactions, message)
+
+
+def test_pages_that_unpack_to_more_than_rows_may_take_are_refused_before_that(store: Store, shard: Path) -> None:
+    bomb = changed(shard, "joint_positions", [0.0] * 100_000)
+    assert len(bomb) < 100_000
+    forge(shard, {"interactions.parquet": bomb})
+    refused(store.interactions, "unpacks to more than")
+
+
+def test_a_long_text_that_a_dictionary_repeats_is_refused_before_it_is_repeated(shard: Path) -> None:
+    rows = pq.read_table(shard / "interactions.parquet").take(pa.array([0] * 1000))
+    names = ("object_id", "object_category", "target_link", "target_joint", "method", "proposer", "fidelity")
+    texts = dict.fromkeys(names, "x" * MAX_TEXT)
+    for name, text in (texts | {"joint_names": "x" * MAX_JOINT_NAMES}).items():
+        index = rows.schema.get_field_index(name)
+        field = rows.schema.field(index)
+        rows = rows.set_column(index, field, pa.array([text] * len(rows), field.type))
+    assert len(packed(rows)) < 300_000
+    refused(lambda: read_table(packed(rows), INTERACTION_COLUMNS, 1000, "rows"), "unpacks to")
+
+
+def test_a_footer_that_claims_gigabytes_is_refused(store: Store, shard: Path) -> None:
+    data = (shard / "interactions.parquet").read_bytes()
+    forge(shard, {"interactions.parquet": data[:-8] + (2**31 - 1).to_bytes(4, "little") + b"PAR1"})
+    refused(store.interactions, "a footer of more than")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("observations", 2**62, "more or fewer rows"),
+        ("interactions", -1, "more or fewer rows"),
+        ("observations", 2, "add up"),
+        ("first_observation", 5, "follow each other"),
+        ("rollout", 5, "follow each other"),
+        ("status", "splendid", "column status holds 'splendid'"),
+    ],
+)
+def test_rollouts_that_do_not_fit_the_shard_are_refused(
+    store: Store, shard: Path, name: str, value: Any, message: str
+) -> None:
+    forge(shard, {"rollouts.parquet": changed(shard, name, value, "rollouts.parquet")})
+    refused(store.rollouts, message)
+    assert verify(store)
+
+
+@pytest.mark.parametrize(("name", "value"), [("outcome", "splendid"), ("motion", float("nan"))])
+def test_a_learner_is_given_no_rows_that_are_no_records(store: Store, shard: Path, name: str, value: Any) -> None:
+    forge(shard, {"interactions.parquet": changed(shard, name, value)})
+    refused(lambda: load_dataset(store, NetworkConfig()), f"column {name} holds")
+
+
+@pytest.mark.parametrize(
+    "text", [b'{"a": [' + b"{}," * MAX_VALUES + b"{}]}", b"[" * 50_000, b'{"a":' * 50_000, b'{"a": 1, "a": 2}']
+)
+def test_documents_that_are_too_large_or_too_deep_or_ambiguous_are_refused(text: bytes) -> None:
+    refused(lambda: parse_object(text, "manifest", unique=True), "manifest: (holds more|not valid JSON)")
 
 
 def test_chunks_of_rubbish_are_refused(store: Store, shard: Path) -> None:

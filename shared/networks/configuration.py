@@ -6,6 +6,8 @@ from pydantic import Field, model_validator
 
 from shared.configuration import StrictModel
 
+MAX_LEVEL_NUMBERS = 1 << 25
+"""What a set abstraction may compute of a cloud at a time: centres by neighbours by width. As published: 2 million."""
 Width = Annotated[int, Field(ge=1, le=2048)]
 Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=8)]
 
@@ -59,6 +61,12 @@ class NetworkConfig(StrictModel):
             raise ValueError(f"radii, abstraction and propagation need {levels} entries each, one for each of centres")
         if any(coarse > fine for fine, coarse in zip(self.centres, self.centres[1:], strict=False)):
             raise ValueError(f"centres must not grow from level to level; given {self.centres}")
+        for centres, widths in zip(self.centres, self.abstraction, strict=True):
+            if centres * self.neighbours * max(widths) > MAX_LEVEL_NUMBERS:
+                raise ValueError(
+                    f"{centres} centres by {self.neighbours} neighbours by {max(widths)} numbers are more than "
+                    f"{MAX_LEVEL_NUMBERS}; choose fewer"
+                )
         if self.propagation[-1][-1] != self.feature_width:
             raise ValueError(f"propagation must end in feature_width ({self.feature_width})")
         return self

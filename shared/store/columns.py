@@ -5,19 +5,23 @@ import json
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from shared.records import InteractionRecord, RolloutRecord
-from shared.vocabulary import Float
+from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
+from shared.vocabulary import Direction, Float, Order, OutcomeKind, Primitive, Role
 
 Row = TypeVar("Row")
 
 LIST = -1
 """Width of a cell that holds any number of numbers."""
+MAX_TEXT = 200
+"""Characters of a cell, unless its column says otherwise."""
+MAX_JOINT_NAMES = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +61,9 @@ class Column(Generic[Row]):
         content: whether it enters the content digest; what depends on the shard, on time or on other columns does not.
         default: of a column that came after others, what rows hold that were written before; None for the first ones.
             Such a column is no content, since older software could not compute the digest (docs/compatibility.md).
+        allowed: the texts that there are; None: any that is printable.
+        longest: characters of a text.
+        finite: whether a number is never NaN or infinite.
     """
 
     name: str
@@ -70,6 +77,10 @@ class Column(Generic[Row]):
     def __post_init__(self) -> None:
         """Hold a column that was added to what older software can verify."""
         assert self.default is None or not self.content, f"{self.name} has a default, so it must be no content"
+
+    allowed: type[StrEnum] | None = None
+    longest: int = MAX_TEXT
+    finite: bool = True
 
     @property
     def arrow_type(self) -> Any:
@@ -130,12 +141,26 @@ def _rollout_columns() -> tuple[Column[RolloutRow], ...]:
         Column("part_mass", "<f8", 0, "hidden: mass of a movable part, kg", lambda x: r(x).dynamics.part_mass),
         Column("joint_friction", "<f8", 0, "hidden: N m or N", lambda x: r(x).dynamics.joint_friction),
         Column("surface_friction", "<f8", 0, "hidden: coefficient", lambda x: r(x).dynamics.surface_friction),
-        Column("direction", "", 0, "hidden: ways the joint turns", lambda x: r(x).dynamics.direction),
+        Column(
+            "direction",
+            "",
+            0,
+            "hidden: ways the joint turns",
+            lambda x: r(x).dynamics.direction,
+            allowed=Direction,
+        ),
         Column("azimuth_deg", "<f8", 0, "camera", lambda x: r(x).azimuth_deg),
         Column("elevation_deg", "<f8", 0, "camera", lambda x: r(x).elevation_deg),
         Column("seed", "<u8", 0, "the plan's seed", lambda x: r(x).seed),
         Column("fidelity", "", 0, "name of the preset", lambda x: r(x).fidelity),
-        Column("status", "", 0, "ok, nothing-to-act-on, never-at-rest or quarantined", lambda x: r(x).status),
+        Column(
+            "status",
+            "",
+            0,
+            "ok, nothing-to-act-on, never-at-rest or quarantined",
+            lambda x: r(x).status,
+            allowed=RolloutStatus,
+        ),
         Column("observations", "<i8", 0, "how many", lambda x: len(r(x).observations)),
         Column("interactions", "<i8", 0, "how many", lambda x: len(r(x).interactions)),
         Column("first_observation", "<i8", 0, "index in the shard", lambda x: x.first_observation, content=False),
@@ -171,12 +196,16 @@ def _action_columns() -> tuple[Column[InteractionRow], ...]:
     )
 
 
+def _names_of(row: InteractionRow) -> str:
+    return json.dumps(list(row.interaction.joint_names))
+
+
 def _choice_columns() -> tuple[Column[InteractionRow], ...]:
     i = operator.attrgetter("interaction")
     return (
-        Column("primitive", "", 0, "gripper primitive", lambda x: i(x).primitive),
-        Column("order", "", 0, "restart or continue", lambda x: i(x).order),
-        Column("role", "", 0, "what the row is for", lambda x: i(x).role),
+        Column("primitive", "", 0, "gripper primitive", lambda x: i(x).primitive, allowed=Primitive),
+        Column("order", "", 0, "restart or continue", lambda x: i(x).order, allowed=Order),
+        Column("role", "", 0, "what the row is for", lambda x: i(x).role, allowed=Role),
         Column("proposer", "", 0, "who chose the action", lambda x: i(x).proposer),
         Column("policy_version", "<i4", 0, "policy it used; 0: none", lambda x: i(x).policy_version),
         Column("method", "", 0, "evaluation: whose try", lambda x: i(x).method),
@@ -184,7 +213,14 @@ def _choice_columns() -> tuple[Column[InteractionRow], ...]:
         Column("target_part", "<i4", 0, "1-based movable part under p", lambda x: i(x).target_part),
         Column("target_link", "", 0, "its link", lambda x: i(x).target_link),
         Column("target_joint", "", 0, "its joint", lambda x: i(x).target_joint),
-        Column("joint_names", "", 0, "all joints, a JSON list", lambda x: json.dumps(list(i(x).joint_names))),
+        Column(
+            "joint_names",
+            "",
+            0,
+            "all joints, a JSON list",
+            lambda x: json.dumps(list(i(x).joint_names)),
+            longest=MAX_JOINT_NAMES,
+        ),
         Column("joint_positions", "<f8", LIST, "all joints at the start", lambda x: i(x).joint_positions),
         Column("joint_limits", "<f8", LIST, "lower, upper of each joint", lambda x: i(x).joint_limits.ravel()),
         Column("joint_twist", "<f8", 6, "hidden: (w, v) of the target joint, world", lambda x: i(x).joint_twist),
@@ -195,13 +231,13 @@ def _choice_columns() -> tuple[Column[InteractionRow], ...]:
 def _outcome_columns() -> tuple[Column[InteractionRow], ...]:
     i, o = operator.attrgetter("interaction"), operator.attrgetter("interaction.outcome")
     return (
-        Column("outcome", "", 0, "how the trial ended", lambda x: o(x).kind),
+        Column("outcome", "", 0, "how the trial ended", lambda x: o(x).kind, allowed=OutcomeKind),
         Column("motion", "<f8", 0, "m, rad or length", lambda x: o(x).motion),
         Column("success", "|b1", 0, "r", lambda x: o(x).success),
-        Column("start_joint_position", "<f8", 0, "of the target", lambda x: o(x).start_joint_position),
-        Column("end_joint_position", "<f8", 0, "of the target", lambda x: o(x).end_joint_position),
-        Column("displacement", "<f8", 3, "of the touched point, world", lambda x: o(x).displacement),
-        Column("grasp_opening", "<f8", 0, "both fingers after closing", lambda x: o(x).grasp_opening),
+        Column("start_joint_position", "<f8", 0, "of the target", lambda x: o(x).start_joint_position, finite=False),
+        Column("end_joint_position", "<f8", 0, "of the target", lambda x: o(x).end_joint_position, finite=False),
+        Column("displacement", "<f8", 3, "of the touched point, world", lambda x: o(x).displacement, finite=False),
+        Column("grasp_opening", "<f8", 0, "both fingers after closing", lambda x: o(x).grasp_opening, finite=False),
         Column("steps", "<i8", 0, "physics steps", lambda x: o(x).steps),
         Column("seconds", "<f8", 0, "wall time", lambda x: i(x).seconds, content=False),
     )
@@ -216,6 +252,7 @@ def _of_rollout(column: Column[RolloutRow]) -> Column[InteractionRow]:
         column.description,
         lambda row: column.value(RolloutRow(row.rollout, row.first_observation)),
         content=False,
+        allowed=column.allowed,
     )
 
 

@@ -18,14 +18,15 @@ Names that begin with ".tmp-" are work in progress or its remnants; names that b
 
 import re
 import sys
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from shared.configuration import StrictModel
+from shared.documents import MAX_VALUES, parse_object, problem_of
 from shared.errors import SchemaVersionError, StoreError
 from shared.plan import Job, Setting
-from shared.store.sealed import is_sealed, parse_object, unseal
+from shared.store.sealed import is_sealed, unseal
 
 SCHEMA_VERSION = 1
 """What the number promises, and when it grows, is told in docs/compatibility.md."""
@@ -49,6 +50,10 @@ MAX_ALL_POINTS = 1 << 25
 """Bounds of one shard: rollouts, interactions and observations; N; and points of all clouds. A hostile manifest
 cannot ask for unbounded work."""
 
+MAX_MANIFEST_VALUES = 6 * MAX_ROWS
+"""A digest of each rollout, four values where it was given up, and the files."""
+MAX_ROLLOUTS = 10**12
+"""Of a plan: the names of shards have room for no more."""
 MAX_REASON = 500
 """Characters."""
 
@@ -79,8 +84,8 @@ class ShardManifest(StrictModel):
 
     schema_version: int = SCHEMA_VERSION
     plan_key: str = Field(pattern=rf"^{PLAN_KEY}$")
-    start: int = Field(ge=0)
-    stop: int = Field(ge=1)
+    start: int = Field(ge=0, lt=MAX_ROLLOUTS)
+    stop: int = Field(ge=1, le=MAX_ROLLOUTS)
     interactions: int = Field(ge=0, le=MAX_ROWS)
     observations: int = Field(ge=0, le=MAX_ROWS)
     points: int = Field(ge=1, le=MAX_POINTS)
@@ -140,7 +145,7 @@ class StoreDocument(StrictModel):
 Document = TypeVar("Document", bound=BaseModel)
 
 
-def parse_document(model: type[Document], data: bytes, source: str, what: str) -> Document:
+def parse_sealed(model: type[Document], data: bytes, source: str, what: str, values: int = MAX_VALUES) -> Document:
     """A sealed document from hostile bytes; fields that this software does not know are kept, wherever they are.
 
     Args:
@@ -148,37 +153,37 @@ def parse_document(model: type[Document], data: bytes, source: str, what: str) -
         data: the file.
         source: what messages call it.
         what: what it should be, for messages, such as "a manifest".
+        values: the most that it may hold.
 
     Raises:
         SchemaVersionError: it is of another schema version.
         StoreError: it is damaged or foreign.
     """
     if "schema_version" in model.model_fields:
-        check_schema_version(data, source)
+        check_schema_version(parse_object(data, source, values), source)
     try:
-        return model.model_validate(unseal(data, source), extra="allow")
+        return model.model_validate(unseal(data, source, values), extra="allow")
     except ValidationError as error:
-        raise StoreError(f"{source}: not {what} ({_first(error)}); the file is damaged or foreign") from None
+        raise StoreError(f"{source}: not {what} ({problem_of(error)}); the file is damaged or foreign") from None
 
 
 def parse_manifest(data: bytes, source: str) -> ShardManifest:
-    """A manifest from hostile bytes; raises as `parse_document` does."""
-    return parse_document(ShardManifest, data, source, "a manifest")
+    """A manifest from hostile bytes; raises as `parse_sealed` does."""
+    return parse_sealed(ShardManifest, data, source, "a manifest", MAX_MANIFEST_VALUES)
 
 
 def parse_store_document(data: bytes, source: str) -> StoreDocument:
-    """store.json from hostile bytes; raises as `parse_document` does."""
-    return parse_document(StoreDocument, data, source, "a store's description")
+    """store.json from hostile bytes; raises as `parse_sealed` does."""
+    return parse_sealed(StoreDocument, data, source, "a store's description")
 
 
-def check_schema_version(data: bytes, source: str) -> None:
+def check_schema_version(content: dict[str, Any], source: str) -> None:
     """Refuse documents of other schema versions.
 
     Raises:
         SchemaVersionError: the version is another.
         StoreError: it names no version, or was damaged where it names it.
     """
-    content = parse_object(data, source)
     version = content.get("schema_version")
     if version == SCHEMA_VERSION:
         return
@@ -203,8 +208,3 @@ def parse_shard_id(name: str) -> Job | None:
     # One text for all jobs of a plan, since there may be millions.
     job = Job(sys.intern(match["plan"]), int(match["start"]), int(match["stop"]))
     return job if job.start < job.stop and job.shard_id == name else None
-
-
-def _first(error: ValidationError) -> str:
-    problem = error.errors()[0]
-    return f"{'.'.join(str(part) for part in problem['loc']) or 'content'}: {problem['msg']}"[:160]

@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from shared.documents import parse_object
 from shared.errors import SchemaVersionError, StoreError, UsageError
 from shared.store import policies, reader
 from shared.store.layout import (
@@ -27,7 +28,7 @@ from shared.store.layout import (
 )
 from shared.store.place import Folder, Place, place_of
 from shared.store.presence import alone
-from shared.store.sealed import parse_object, seal, unseal
+from shared.store.sealed import seal, unseal
 from shared.store.store import Store
 from shared.store.writer import commit_files
 

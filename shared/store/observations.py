@@ -1,30 +1,42 @@
 """The clouds of a shard as a Zarr v3 group: one array a field, few and large chunks, encoded and decoded in memory.
 
 Zarr writes to a dictionary here and the shard writer puts that on the disk, since Zarr itself forces nothing to the
-disk. Reading goes the same way, so that only files whose size and checksum the manifest vouches for reach Zarr.
+disk. Reading does without Zarr: the manifest says what each file must be, so that no claim of the metadata is followed,
+and a chunk's header is checked before the decoder, which believes it, sees the chunk.
 
 Shapes: O observations of a shard, N points of a cloud.
 """
 
 import json
 import math
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import zarr
+from numcodecs.blosc import Blosc  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec
-from zarr.core.buffer import Buffer, default_buffer_prototype
+from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
+from shared.documents import parse_object
 from shared.errors import StoreError
 from shared.observation import NORMAL_STEPS, pack_normals, round_normals, round_points, unpack_normals
 from shared.vocabulary import Float, Float32, Observation
 
 MAX_CHUNK_BYTES = 64 << 20
+MAX_METADATA_BYTES = 1 << 16
+RIGID = 1e-3
+"""How far a camera's axes may be from three perpendicular ones of length 1."""
 _GROUP_FILE = "zarr.json"
+_BLOSC_HEADER = struct.Struct("<4B3I")
+"""Versions of the format and of its compressor, flags, size of an element; bytes unpacked, of a block, and in all."""
+_LITTLE = {"endian": "little"}
+_CHUNK_KEYS = {"name": "default", "configuration": {"separator": "."}}
+"""Chunks lie in "c.0.0.0" beside the metadata, not in "c/0/0/0": three folders an array less to force to the disk."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +92,15 @@ class ArrayKind:
         most = MAX_CHUNK_BYTES // (math.prod(shape) * np.dtype(self.kept).itemsize)
         return (max(1, min(observations, most)), *shape)
 
+    def chunk_bytes(self, observations: int, points: int) -> int:
+        """Size of a chunk, unpacked; the last one is as large as the others."""
+        return math.prod(self.chunk(observations, points)) * np.dtype(self.kept).itemsize
+
+    def chunk_files(self, observations: int, points: int) -> list[str]:
+        """Paths within the group of all chunks, in order."""
+        count = -(-observations // self.chunk(observations, points)[0])
+        return [f"{self.name}/c.{number}{'.0' * len(self.tail)}" for number in range(count)]
+
     def pack(self, seen: NDArray[Any]) -> NDArray[Any]:
         """What is stored, for a field as an observation has it."""
         return pack_normals(seen) if self.name == "normals" else seen.astype(self.kept)
@@ -133,7 +154,6 @@ def encode(observations: Sequence[Observation], points: int) -> dict[str, bytes]
             chunks=kind.chunk(len(observations), points),
             filters=None,
             compressors=BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"),
-            # "c.0.0.0" beside the metadata instead of "c/0/0/0": three folders an array less to force to the disk.
             chunk_key_encoding={"name": "default", "separator": "."},
             attributes={"description": kind.description},
             # Otherwise a chunk of zeros would have no file, and a lost file would read as zeros.
@@ -147,62 +167,106 @@ def encode(observations: Sequence[Observation], points: int) -> dict[str, bytes]
     return files | {path: json.dumps(one, separators=(",", ":")).encode() for path, one in metadata.items()}
 
 
-def file_names(observations: int, points: int) -> Iterator[str]:
-    """Paths within the group of all the files that a shard of this size has."""
-    yield _GROUP_FILE
+def file_limits(observations: int, points: int) -> Iterator[tuple[str, int]]:
+    """Paths within the group of all the files that a shard of this size has, and the most bytes that each may have."""
+    yield _GROUP_FILE, MAX_METADATA_BYTES
     for kind in ARRAYS:
-        yield f"{kind.name}/{_GROUP_FILE}"
-        chunk = kind.chunk(observations, points)
-        rest = ".0" * len(kind.tail)
-        yield from (f"{kind.name}/c.{k}{rest}" for k in range(-(-observations // chunk[0])))
-
-
-def size_limit(observations: int, points: int) -> int:
-    """Bytes that no file of the group exceeds; incompressible data grow by a header only."""
-    chunks = (math.prod(k.chunk(observations, points)) * np.dtype(k.kept).itemsize for k in ARRAYS)
-    return max(chunks) + (1 << 16)
+        yield f"{kind.name}/{_GROUP_FILE}", MAX_METADATA_BYTES
+        # Data that cannot be compressed grow by a header.
+        most = kind.chunk_bytes(observations, points) + _BLOSC_HEADER.size
+        yield from ((path, most) for path in kind.chunk_files(observations, points))
 
 
 def decode(files: Mapping[str, bytes], observations: int, points: int, source: str) -> ObservationArrays:
     """The arrays of a group from hostile files.
 
+    Args:
+        files: those that `file_limits` names, by path within the group.
+        observations: O.
+        points: N.
+        source: what messages call the group.
+
     Raises:
         StoreError: they are not what `encode` makes for as many observations and points.
     """
-    for kind in ARRAYS:
-        _check_array(files, kind, observations, points, source)
-    buffer = default_buffer_prototype().buffer
-    memory = MemoryStore({path: buffer.from_bytes(data) for path, data in files.items()}, read_only=True)
-    try:
-        group = zarr.open_group(memory, mode="r", zarr_format=3)
-        arrays = {kind.name: kind.unpack(np.asarray(group[kind.name][...])) for kind in ARRAYS}  # type: ignore[index]
-    except (ValueError, TypeError, KeyError, RuntimeError) as error:
-        line = " ".join(str(error).split())[:100]
-        raise StoreError(f"{source}: cannot be decoded ({line}); the file is damaged or foreign") from None
-    return ObservationArrays(**arrays)
+    group = parse_object(files[_GROUP_FILE], f"{source}/{_GROUP_FILE}")
+    if group.get("node_type") != "group" or group.get("consolidated_metadata") is not None:
+        raise StoreError(f"{source}: its Zarr metadata are not a plain group's; the file is damaged or foreign")
+    arrays = ObservationArrays(
+        **{kind.name: _decode_array(files, kind, observations, points, source) for kind in ARRAYS}
+    )
+    axes = arrays.world_from_camera[:, :3, :3]
+    if not np.isfinite(arrays.points).all() or not np.isfinite(arrays.world_from_camera).all():
+        raise StoreError(f"{source}: holds numbers that are not finite; the file is damaged or foreign")
+    if (np.abs(axes @ axes.transpose(0, 2, 1) - np.eye(3)) > RIGID).any():
+        raise StoreError(f"{source}/world_from_camera: is no pose of a camera; the file is damaged or foreign")
+    return arrays
 
 
-def _check_array(files: Mapping[str, bytes], kind: ArrayKind, observations: int, points: int, source: str) -> None:
-    """Hold an array's metadata and the sizes that its chunks claim to what the manifest implies."""
+def _decode_array(
+    files: Mapping[str, bytes], kind: ArrayKind, observations: int, points: int, source: str
+) -> NDArray[Any]:
     where = f"{source}/{kind.name}"
-    chunk = kind.chunk(observations, points)
-    try:
-        metadata = json.loads(files[f"{kind.name}/{_GROUP_FILE}"])
-        claims = (
-            metadata["node_type"],
-            metadata["shape"],
-            metadata["data_type"],
-            metadata["chunk_grid"]["configuration"]["chunk_shape"],
-            [codec["name"] for codec in metadata["codecs"]],
+    _check_metadata(files[f"{kind.name}/{_GROUP_FILE}"], kind, observations, points, where)
+    size = kind.chunk_bytes(observations, points)
+    kept = np.empty((observations, *kind.shape(points)), kind.kept)
+    rows = kind.chunk(observations, points)[0]
+    for number, path in enumerate(kind.chunk_files(observations, points)):
+        part = kept[number * rows : (number + 1) * rows]
+        unpacked = np.frombuffer(_decode_chunk(files[path], size, f"{source}/{path}"), kind.kept)
+        part[:] = unpacked[: part.size].reshape(part.shape)
+    if kind.kept == "|b1" and (kept.view(np.uint8) > 1).any():
+        raise StoreError(f"{where}: holds bytes that are neither true nor false; the file is damaged or foreign")
+    return kind.unpack(kept)
+
+
+def _decode_chunk(data: bytes, size: int, where: str) -> bytes:
+    """What a chunk holds, `size` bytes."""
+    # The decoder reads and writes as many bytes as the header says.
+    claimed = _BLOSC_HEADER.unpack_from(data)[4::2] if len(data) >= _BLOSC_HEADER.size else ()
+    if claimed != (size, len(data)):
+        raise StoreError(
+            f"{where}: claims another size than {size} bytes in {len(data)}; the chunk is damaged or foreign"
         )
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise StoreError(f"{where}: its Zarr metadata are malformed; the file is damaged or foreign") from None
-    shape = [observations, *kind.shape(points)]
-    expected = ("array", shape, np.dtype(kind.kept).name, list(chunk), ["bytes", "blosc"])
-    if claims != expected:
-        raise StoreError(f"{where}: Zarr metadata claim {str(claims)[:120]}, the manifest implies {expected}")
-    chunk_bytes = math.prod(chunk) * np.dtype(kind.kept).itemsize
-    for path, data in files.items():
-        # Blosc trusts the unpacked size in its header, and would allocate whatever that says.
-        if path.startswith(f"{kind.name}/c.") and int.from_bytes(data[4:8], "little") != chunk_bytes:
-            raise StoreError(f"{where}: a chunk claims another size than {chunk_bytes} bytes; it is damaged or foreign")
+    try:
+        unpacked: bytes = Blosc().decode(data)
+    except (RuntimeError, ValueError) as error:
+        line = " ".join(str(error).split())[:100]
+        raise StoreError(f"{where}: cannot be decoded ({line}); the chunk is damaged or foreign") from None
+    return unpacked
+
+
+def _check_metadata(data: bytes, kind: ArrayKind, observations: int, points: int, where: str) -> None:
+    """Hold an array's metadata, which others read it by, to what the manifest implies."""
+    metadata = parse_object(data, f"{where}/{_GROUP_FILE}")
+    codecs, grid = metadata.get("codecs"), metadata.get("chunk_grid")
+    claims = {
+        "node_type": metadata.get("node_type"),
+        "shape": metadata.get("shape"),
+        "data_type": metadata.get("data_type"),
+        "chunk_grid": grid.get("configuration") if isinstance(grid, dict) else grid,
+        "chunk_key_encoding": metadata.get("chunk_key_encoding"),
+        "codecs": [_codec(each) for each in codecs] if isinstance(codecs, list) else codecs,
+        "storage_transformers": metadata.get("storage_transformers") or [],
+    }
+    implied = {
+        "node_type": "array",
+        "shape": [observations, *kind.shape(points)],
+        "data_type": np.dtype(kind.kept).name,
+        "chunk_grid": {"chunk_shape": list(kind.chunk(observations, points))},
+        "chunk_key_encoding": _CHUNK_KEYS,
+        "codecs": ["bytes", "blosc"],
+        "storage_transformers": [],
+    }
+    for name, value in implied.items():
+        if claims[name] != value:
+            raise StoreError(
+                f"{where}: Zarr metadata claim {name} {str(claims[name])[:120]}, not {value}; it is foreign"
+            )
+
+
+def _codec(told: Any) -> Any:
+    """The name of a codec, if its configuration is one that is decoded here."""
+    if not isinstance(told, dict) or (told.get("name") == "bytes" and told.get("configuration", _LITTLE) != _LITTLE):
+        return told
+    return told.get("name")

@@ -6,12 +6,12 @@ from collections.abc import Collection, Mapping
 
 from shared.configuration import StrictModel
 from shared.errors import StoreError
-from shared.store.layout import MAX_DOCUMENT_BYTES, POLICIES_FOLDER, SCHEMA_VERSION, FileEntry, parse_document
+from shared.store.layout import MAX_DOCUMENT_BYTES, POLICIES_FOLDER, SCHEMA_VERSION, FileEntry, parse_sealed
 from shared.store.place import Folder, Place, Publication
 from shared.store.sealed import seal
 
 INDEX_FILE = "index.json"
-MAX_POLICY_BYTES = 1 << 30
+MAX_POLICY_BYTES = (1 << 28) + (1 << 20)
 MAX_VERSION = 999_999
 _FILE_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,99}")
 
@@ -97,7 +97,7 @@ def _read_index(place: Place, version: int) -> PolicyIndex:
         known = ", ".join(str(v) for v in policy_versions(place)) or "none"
         raise StoreError(f"{folder}: there is no policy {version}; published: {known}")
     path = f"{folder}/{INDEX_FILE}"
-    index = parse_document(PolicyIndex, folder.read(INDEX_FILE, MAX_DOCUMENT_BYTES), path, "the index of a policy")
+    index = parse_sealed(PolicyIndex, folder.read(INDEX_FILE, MAX_DOCUMENT_BYTES), path, "the index of a policy")
     sizes = sum(entry.size for entry in index.files.values())
     if index.version != version or not all(map(_allowed, index.files)) or sizes > MAX_POLICY_BYTES:
         raise StoreError(f"{path}: not the index of policy {version}; the file is foreign")

@@ -1,18 +1,19 @@
 """Reading shards, which are hostile until their sizes, checksums, schemas and references have been checked."""
 
 import hashlib
-import json
 from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
 from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
+from pydantic_core import from_json
 
 from shared.errors import StoreError
 from shared.plan import Job, ObjectRef
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store import observations
-from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, Column
+from shared.store.columns import INTERACTION_COLUMNS, MAX_TEXT, ROLLOUT_COLUMNS
 from shared.store.coverage import ROLLOUT_COLUMN, Part
 from shared.store.layout import (
     INTERACTIONS_FILE,
@@ -27,8 +28,8 @@ from shared.store.layout import (
 )
 from shared.store.observations import ObservationArrays
 from shared.store.place import Folder, Place
-from shared.store.tables import MAX_ROW_BYTES, column_values, read_table, unknown_columns
-from shared.store.validity import check_quarantined, check_rollouts
+from shared.store.tables import column_values, read_table, size_limit, unknown_columns
+from shared.store.validity import MAX_PARTS, check_quarantined, check_rollouts
 from shared.vocabulary import (
     Action,
     Direction,
@@ -43,6 +44,8 @@ from shared.vocabulary import (
 
 Item = TypeVar("Item")
 
+_COUNTING = ("observations", "interactions", "first_observation", ROLLOUT_COLUMN)
+"""Columns of rollouts that say which rows of the shard are theirs."""
 _BATCH = 128
 """Shards whose manifests or tables are in memory at once."""
 
@@ -114,12 +117,11 @@ def checked_manifest(shard: Folder, data: bytes) -> ShardManifest:
 
 def expected_files(manifest: ShardManifest) -> dict[str, int]:
     """Paths of all files that the shard must have, and the most bytes each may have, from the counts alone."""
-    clouds = observations.size_limit(manifest.observations, manifest.points)
-    names = observations.file_names(manifest.observations, manifest.points)
+    clouds = observations.file_limits(manifest.observations, manifest.points)
     return {
-        ROLLOUTS_FILE: (manifest.rollouts + 16) * MAX_ROW_BYTES,
-        INTERACTIONS_FILE: (manifest.interactions + 16) * MAX_ROW_BYTES,
-        **{f"{OBSERVATIONS_FOLDER}/{name}": clouds for name in names},
+        ROLLOUTS_FILE: size_limit(manifest.rollouts),
+        INTERACTIONS_FILE: size_limit(manifest.interactions),
+        **{f"{OBSERVATIONS_FOLDER}/{name}": limit for name, limit in clouds},
     }
 
 
@@ -186,9 +188,48 @@ def read_tables(
 
 
 def _table(shard: Folder, manifest: ShardManifest, file: str, data: bytes, names: Sequence[str] | None = None) -> Any:
-    columns: Sequence[Column[Any]] = INTERACTION_COLUMNS if file == INTERACTIONS_FILE else ROLLOUT_COLUMNS
-    rows = manifest.interactions if file == INTERACTIONS_FILE else manifest.rollouts
-    return read_table(data, columns, rows, f"{shard}/{file}", names)
+    """One of the two tables of a shard, whose figures are those of its manifest."""
+    source = f"{shard}/{file}"
+    if file == INTERACTIONS_FILE:
+        table = read_table(data, INTERACTION_COLUMNS, manifest.interactions, source, names)
+        _check_interactions(table, source, manifest)
+        return table
+    # What counts the rest is read always, since it is checked.
+    read = None if names is None else list(dict.fromkeys([*names, *_COUNTING]))
+    table = read_table(data, ROLLOUT_COLUMNS, manifest.rollouts, source, read)
+    _check_rollouts(table, source, manifest)
+    return table if names is None else table.select(list(names))
+
+
+def _check_interactions(table: Any, source: str, manifest: ShardManifest) -> None:
+    """See that the references of a shard's interactions lead to what the shard has."""
+    ranges = {
+        "rollout": (manifest.start, manifest.stop),
+        "observation": (0, manifest.observations),
+        "point_index": (0, manifest.points),
+        "target_part": (1, MAX_PARTS + 1),
+    }
+    for name, (low, high) in ranges.items():
+        if name not in table.column_names or not len(table):
+            continue
+        numbers = table.column(name).to_numpy()
+        if numbers.min() < low or numbers.max() >= high:
+            raise StoreError(
+                f"{source}: column {name} goes from {numbers.min()} to {numbers.max()}, the manifest allows {low} to "
+                f"{high - 1}; the file is foreign"
+            )
+
+
+def _check_rollouts(table: Any, source: str, manifest: ShardManifest) -> None:
+    """See that the rollouts of a shard add up to what the manifest says."""
+    clouds, tries, firsts, numbers = (table.column(name).to_numpy() for name in _COUNTING)
+    most = max(manifest.observations, manifest.interactions)
+    if min(clouds.min(), tries.min()) < 0 or max(clouds.max(), tries.max()) > most:
+        raise StoreError(f"{source}: a rollout has more or fewer rows than the shard; it is foreign")
+    if (clouds.sum(), tries.sum()) != (manifest.observations, manifest.interactions):
+        raise StoreError(f"{source}: the rollouts do not add up to the shard's rows and observations; it is foreign")
+    if (firsts != np.cumsum(clouds) - clouds).any() or (numbers != np.arange(manifest.start, manifest.stop)).any():
+        raise StoreError(f"{source}: the rollouts do not follow each other; it is foreign")
 
 
 def unknown_of(shard: Folder, manifest: ShardManifest) -> dict[str, Any]:
@@ -217,15 +258,10 @@ def read_rollouts(shard: Folder, manifest: ShardManifest) -> tuple[RolloutRecord
     heads = _rows(read_rollout_table(shard, manifest), ROLLOUT_COLUMNS)
     rows = _rows(read_interactions(shard, manifest), INTERACTION_COLUMNS)
     arrays = read_observations(shard, manifest)
-    counts = [int(head["observations"]) for head in heads], [int(head["interactions"]) for head in heads]
-    firsts = np.cumsum([0, *counts[0]])[:-1].tolist()
-    if min((*counts[0], *counts[1])) < 0 or [sum(c) for c in counts] != [len(arrays), len(rows)]:
-        raise StoreError(f"{shard}: the rollouts do not add up to the shard's rows and observations; it is foreign")
-    if [int(head["first_observation"]) for head in heads] != firsts:
-        raise StoreError(f"{shard}: the rollouts do not follow each other in the observations; it is foreign")
     rollouts, row = [], 0
     try:
-        for head, first, clouds, tries in zip(heads, firsts, *counts, strict=True):
+        for head in heads:
+            first, clouds, tries = (int(head[name]) for name in ("first_observation", "observations", "interactions"))
             seen = tuple(arrays.observation(k) for k in range(first, first + clouds))
             rollouts.append(_rollout(head, seen, rows[row : row + tries]))
             row += tries
@@ -300,10 +336,23 @@ def _interaction(row: dict[str, Any]) -> InteractionRecord:
         target_part=int(row["target_part"]),
         target_link=row["target_link"],
         target_joint=row["target_joint"],
-        joint_names=tuple(map(str, json.loads(row["joint_names"]))),
+        joint_names=_joint_names(row["joint_names"]),
         joint_positions=row["joint_positions"],
         joint_limits=row["joint_limits"].reshape(-1, 2),
         joint_twist=row["joint_twist"],
         hand_start=row["hand_start"],
         seconds=float(row["seconds"]),
     )
+
+
+@lru_cache(maxsize=1024)
+def _joint_names(text: str) -> tuple[str, ...]:
+    """The names in a cell; a store has few different ones.
+
+    Raises:
+        ValueError: it is no list of names.
+    """
+    names = from_json(text)
+    if not isinstance(names, list) or not all(isinstance(name, str) and len(name) <= MAX_TEXT for name in names):
+        raise ValueError(f"joint_names is no list of names: {text[:40]!r}")
+    return tuple(names)

@@ -23,7 +23,7 @@ from shared.store.layout import (
     SHARDS_FOLDER,
     STORE_FILE,
     StoreDocument,
-    parse_document,
+    parse_sealed,
     parse_shard_id,
     parse_store_document,
 )
@@ -144,7 +144,7 @@ def _setting_of_any_plan(place: Place) -> Setting | None:
     for name in place.names(PLANS_FOLDER):
         key = f"{PLANS_FOLDER}/{name}"
         try:
-            return parse_document(Plan, place.read(key, MAX_DOCUMENT_BYTES), key, "a plan").setting
+            return parse_sealed(Plan, place.read(key, MAX_DOCUMENT_BYTES), key, "a plan").setting
         except (UnreadableError, SchemaVersionError):
             raise
         except StoreError:

@@ -35,7 +35,7 @@ from shared.store.layout import (
     Quarantined,
     ShardManifest,
     StoreDocument,
-    parse_document,
+    parse_sealed,
     parse_shard_id,
     parse_store_document,
 )
@@ -163,7 +163,7 @@ class Store:
         """
         key = f"{PLANS_FOLDER}/{name}"
         file = f"{self.where}/{key}"
-        plan = parse_document(Plan, self.place.read(key, MAX_DOCUMENT_BYTES), file, "a plan")
+        plan = parse_sealed(Plan, self.place.read(key, MAX_DOCUMENT_BYTES), file, "a plan")
         if f"{plan.key}.json" != name or plan.setting != self.setting:
             raise StoreError(f"{file}: is no plan of this store; the file is damaged or foreign")
         return plan

@@ -1,28 +1,42 @@
 """Parquet: rows to bytes and hostile bytes to columns."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shared.documents import printable
 from shared.errors import StoreError
 from shared.store.columns import INTERACTION_COLUMNS, LIST, ROLLOUT_COLUMNS, Column
+from shared.store.pages import unpacked_size
 
 Row = TypeVar("Row")
+Columns = Sequence[Column[Any]]
 
 MAX_ROW_BYTES = 1 << 16
 """Uncompressed, on average; a row of an object with 255 parts has a tenth of it."""
+MAX_TABLE_BYTES = 256 << 20
+"""Uncompressed; as many rows as a shard may have take a tenth of it, unless their objects have dozens of parts."""
+MAX_FOOTER_BYTES = 1 << 18
+MAX_FOOTER_ITEMS = 256
+"""Of each list in a footer, so that no schema is deeper; the store's have a third of it."""
 
 
-def schema_of(columns: Sequence[Column[Any]]) -> Any:
+def schema_of(columns: Columns) -> Any:
     """The pyarrow schema of some columns."""
     return pa.schema([column.field for column in columns])
 
 
 ROLLOUT_SCHEMA = schema_of(ROLLOUT_COLUMNS)
 INTERACTION_SCHEMA = schema_of(INTERACTION_COLUMNS)
+
+
+def size_limit(rows: int) -> int:
+    """Bytes that a table of so many rows has at the most, packed or unpacked."""
+    return min((rows + 16) * MAX_ROW_BYTES, MAX_TABLE_BYTES)
 
 
 def table_bytes(columns: Sequence[Column[Row]], rows: Sequence[Row], unknown: Any = None) -> bytes:
@@ -35,11 +49,14 @@ def table_bytes(columns: Sequence[Column[Row]], rows: Sequence[Row], unknown: An
 
     Raises:
         ValueError, TypeError, OverflowError: a row does not fit the columns.
+        StoreError: the rows are too large for one file.
     """
     table = pa.Table.from_arrays([_array(column, rows) for column in columns], schema=schema_of(columns))
     for name in () if unknown is None else unknown.column_names:
         if name not in table.column_names:
             table = table.append_column(unknown.schema.field(name), unknown.column(name))
+    if table.nbytes > size_limit(len(rows)):
+        raise StoreError(f"{len(rows)} rows of {table.nbytes} bytes are too many for one shard; divide the job")
     sink = pa.BufferOutputStream()
     # Dictionaries only for text: Arrow's would take all NaNs, and both zeros, for one value.
     # Statistics would cost more than the rows of a small shard, and nobody filters within one.
@@ -49,9 +66,7 @@ def table_bytes(columns: Sequence[Column[Row]], rows: Sequence[Row], unknown: An
     return data
 
 
-def read_table(
-    data: bytes, columns: Sequence[Column[Any]], rows: int, source: str, names: Sequence[str] | None = None
-) -> Any:
+def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Sequence[str] | None = None) -> Any:
     """A table from hostile bytes: the known columns, in their order, then those that newer software added.
 
     Args:
@@ -62,34 +77,48 @@ def read_table(
         names: read these columns only.
 
     Raises:
-        StoreError: not Parquet, other columns, another number of rows, or absurdly large when unpacked.
+        StoreError: not Parquet, other columns, another number of rows, absurdly large when unpacked, or a cell that its
+            column does not allow.
     """
     try:
-        file = pq.ParquetFile(pa.BufferReader(data))
-        metadata, there = file.metadata, file.schema_arrow
-        missing = _missing(there, columns, source)
-        unpacked = sum(metadata.row_group(k).total_byte_size for k in range(metadata.num_row_groups))
-        if metadata.num_rows != rows or unpacked > (rows + 16) * MAX_ROW_BYTES:
-            raise StoreError(f"{source}: {metadata.num_rows} rows, {unpacked} bytes; the manifest says {rows} rows")
-        known = [column.name for column in columns]
-        wanted = list(names) if names is not None else [*known, *(n for n in there.names if n not in known)]
-        table = file.read(columns=[name for name in wanted if name in there.names])
-        table.validate(full=True)
-    except (pa.ArrowException, OSError) as error:
-        line = " ".join(str(error).split())[:100]
+        table = _read(data, columns, rows, source, names)
+    except (pa.ArrowException, OSError, ValueError, LookupError, OverflowError) as error:
+        if isinstance(error, StoreError):
+            raise
+        line = printable(" ".join(str(error).split()), 100)
         raise StoreError(f"{source}: cannot be decoded ({line}); the file is damaged or foreign") from None
+    left = size_limit(rows)
+    fields, arrays = [], []
     for column in columns:
-        if column in missing:
-            table = table.append_column(column.field, pa.array([column.default] * rows, column.arrow_type))
-        elif column.name in table.column_names and table.schema.field(column.name).nullable:
+        if names is not None and column.name not in names:
+            continue
+        fields.append(column.field)
+        if column.name not in table.column_names:
+            arrays.append(pa.array([column.default] * rows, column.arrow_type))
+            continue
+        cells = table.column(column.name)
+        left -= _check_cells(cells, column, left, source)
+        cells = cells.cast(column.arrow_type)
+        if cells.null_count:
             # Older software wrote this shard anew, from some that had the column and some that had not.
-            cells = [column.default if cell is None else cell for cell in table.column(column.name).to_pylist()]
-            place = table.column_names.index(column.name)
-            table = table.set_column(place, column.field, pa.array(cells, column.arrow_type))
-    return table.select(wanted)
+            filled = [column.default if cell is None else cell for cell in cells.to_pylist()]
+            cells = pa.array(filled, column.arrow_type)
+        arrays.append(cells)
+    known = {column.name for column in columns}
+    for field in table.schema:
+        if field.name not in known:
+            cells = table.column(field.name)
+            if pa.types.is_dictionary(field.type):
+                left -= _size_of_texts(cells)
+                if left < 0:
+                    raise StoreError(f"{source}: column {printable(field.name)} is too large; the file is foreign")
+                cells = cells.cast(field.type.value_type)
+            fields.append(pa.field(field.name, cells.type, field.nullable))
+            arrays.append(cells)
+    return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
 
 
-def unknown_columns(table: Any, columns: Sequence[Column[Any]], key: str) -> Any:
+def unknown_columns(table: Any, columns: Columns, key: str) -> Any:
     """Columns of a table that this software does not know, beside its column `key`; missing values may be filled in."""
     known = {column.name for column in columns}
     fields = [field for field in table.schema if field.name == key or field.name not in known]
@@ -110,22 +139,97 @@ def joined(tables: Sequence[Any], source: str) -> Any:
         ) from None
 
 
-def _missing(there: Any, columns: Sequence[Column[Any]], source: str) -> list[Column[Any]]:
-    """Columns that a file lacks and that have a default.
+def _read(data: bytes, columns: Columns, rows: int, source: str, names: Sequence[str] | None) -> Any:
+    """Some columns, or all; texts as dictionaries, which do not grow by being repeated."""
+    file = _open(data, [column.name for column in columns if not column.dtype])
+    there, known = file.schema_arrow, {column.name for column in columns}
+    _check_columns(there, columns, source)
+    wanted = [name for name in there.names if names is None or name in names]
+    if texts := [name for name in wanted if name not in known and pa.types.is_string(there.field(name).type)]:
+        file = _open(data, [*texts, *(column.name for column in columns if not column.dtype)])
+    metadata = file.metadata
+    if metadata.num_rows != rows or metadata.num_row_groups > 1:
+        raise StoreError(f"{source}: {metadata.num_rows} rows; the manifest says {rows} rows: the file is foreign")
+    if metadata.num_row_groups:
+        group = metadata.row_group(0)
+        if group.num_rows != rows:
+            raise ValueError(f"a group of {group.num_rows} rows")
+        unpacked_size(data, group, frozenset(wanted), size_limit(rows))
+    table = file.read(columns=wanted)
+    table.validate(full=True)
+    if len(table) != rows:
+        raise ValueError(f"{len(table)} rows in the columns")
+    return table
+
+
+def _open(data: bytes, texts: Sequence[str]) -> Any:
+    """A Parquet file whose footer is bounded, and some of whose columns are read as dictionaries."""
+    if int.from_bytes(data[-8:-4], "little") > MAX_FOOTER_BYTES:
+        raise ValueError(f"a footer of more than {MAX_FOOTER_BYTES} bytes")
+    return pq.ParquetFile(
+        pa.BufferReader(data),
+        read_dictionary=list(texts),
+        thrift_string_size_limit=MAX_FOOTER_BYTES,
+        thrift_container_size_limit=MAX_FOOTER_ITEMS,
+    )
+
+
+def _check_columns(there: Any, columns: Columns, source: str) -> None:
+    """See that a file has the columns that it must have, and none twice.
 
     Raises:
-        StoreError: another column is missing, or one is of another type.
+        StoreError: a column is missing that has no default, or one is of another type.
     """
     names = there.names
-    for column in columns:
-        found = names.count(column.name)
-        nullable = found == 1 and column.default is not None and there.field(column.name).nullable
-        is_right = found == 1 and there.field(column.name).equals(column.field.with_nullable(nullable))
-        if not is_right and (found or column.default is None):
-            raise StoreError(f"{source}: has other columns than this schema version; the file is damaged or foreign")
+    if names == [column.name for column in columns] and there.equals(_schema_when_read(tuple(columns))):
+        return
     if len(set(names)) != len(names):
         raise StoreError(f"{source}: has two columns of one name; the file is damaged or foreign")
-    return [column for column in columns if column.name not in names]
+    for column, field in zip(columns, _schema_when_read(tuple(columns)), strict=True):
+        is_there = column.name in names
+        nullable = is_there and column.default is not None and there.field(column.name).nullable
+        is_right = is_there and there.field(column.name).equals(field.with_nullable(nullable))
+        if not is_right and (is_there or column.default is None):
+            raise StoreError(f"{source}: has other columns than this schema version; the file is damaged or foreign")
+
+
+def _check_cells(cells: Any, column: Column[Any], most: int, source: str) -> int:
+    """Hold the cells of a column to what it allows; returns the bytes of its texts."""
+    size = 0
+    for chunk in cells.chunks:
+        if column.dtype:
+            numbers = (chunk.flatten() if column.width else chunk).drop_null()
+            if column.finite and column.dtype[1] == "f" and not np.isfinite(numbers.to_numpy()).all():
+                raise StoreError(f"{source}: column {column.name} holds a number that is not finite; it is foreign")
+            continue
+        for word in chunk.dictionary.to_pylist():
+            if column.allowed is not None and word not in list(column.allowed):
+                raise StoreError(f"{source}: column {column.name} holds '{printable(word)}'; it is damaged or foreign")
+            if len(word) > column.longest or not word.isprintable():
+                what = f"a text of {len(word)} characters, '{printable(word, 40)}'"
+                raise StoreError(f"{source}: column {column.name} holds {what}; it is damaged or foreign")
+    if not column.dtype:
+        size = _size_of_texts(cells)
+    if size > most:
+        raise StoreError(f"{source}: column {column.name} unpacks to {size} bytes; the file is damaged or foreign")
+    return size
+
+
+def _size_of_texts(cells: Any) -> int:
+    """Bytes of the texts that a column of dictionaries stands for."""
+    size = 0
+    for chunk in cells.chunks:
+        lengths = np.array([len((word or "").encode()) for word in chunk.dictionary.to_pylist()], np.int64)
+        size += int(lengths[chunk.indices.drop_null().to_numpy()].sum())
+    return size
+
+
+@cache
+def _schema_when_read(columns: tuple[Column[Any], ...]) -> Any:
+    fields = [column.field for column in columns]
+    return pa.schema(
+        [f if f.type != pa.string() else f.with_type(pa.dictionary(pa.int32(), pa.string())) for f in fields]
+    )
 
 
 def column_values(table: Any, column: Column[Any]) -> Any:

@@ -8,11 +8,11 @@ import numpy as np
 from shared.errors import StoreError
 from shared.plan import Job
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
+from shared.store.columns import MAX_TEXT
 from shared.store.layout import MAX_ALL_POINTS, MAX_ROWS, Quarantined
 from shared.store.observations import check_observation
 from shared.vocabulary import Float
 
-MAX_TEXT = 200
 MAX_PARTS = 255
 """Movable parts that an object may have: part ids are bytes."""
 
