@@ -23,6 +23,7 @@ from shared.files import TEMPORARY_PREFIX
 from shared.plan import Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import policies, reader
+from shared.store.conformance import check_place
 from shared.store.coverage import ROLLOUT_COLUMN, Part, parts_of
 from shared.store.difference import difference_of
 from shared.store.digest import combined_digest
@@ -82,7 +83,8 @@ class Store:
             setting: of all its rows.
 
         Raises:
-            StoreError: a store of another setting is there, or files that are no store, or it cannot be made.
+            StoreError: a store of another setting is there, or files that are no store, or it cannot be made, or the
+                bucket's server lets several writers of one key win.
             UsageError: the setting's seed is too large to be stored, or the URL is not allowed.
         """
         if setting.seed > MAX_SEED:
@@ -91,6 +93,9 @@ class Store:
         try:
             if not place.exists(STORE_FILE):
                 _refuse_foreign(place)
+                if place.writes_in_place:
+                    # Only what a server promises keeps two writers of a shard apart there; some break it.
+                    check_place(place)
                 created = datetime.now(UTC).isoformat(timespec="seconds")
                 document = StoreDocument(setting=setting, software=software_versions(), created=created)
                 place.create(STORE_FILE, seal(document.model_dump(mode="json")))
