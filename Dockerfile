@@ -13,13 +13,15 @@ COPY shared shared
 COPY collector collector
 COPY learner learner
 COPY cluster cluster
+# Of the package, separated by commas.
+ARG EXTRAS=cluster
 RUN python -m venv /opt/adaafford \
-    && /opt/adaafford/bin/pip install --no-cache-dir --constraint constraints.txt ".[cluster]"
+    && /opt/adaafford/bin/pip install --no-cache-dir --constraint constraints.txt ".[${EXTRAS}]"
 
 FROM python:3.11-slim-bookworm
-# SAPIEN is linked against X11 although it opens no window; a KubeRay pod asks its own health by wget.
+# KubeRay checks a pod's health by a command that calls wget.
 RUN apt-get update \
-    && apt-get install --yes --no-install-recommends libx11-6 wget \
+    && apt-get install --yes --no-install-recommends wget \
     && rm -rf /var/lib/apt/lists/* \
     && useradd --uid 1000 --create-home adaafford \
     && install --directory --owner=1000 --group=1000 /data

@@ -6,7 +6,7 @@ STAMP := $(VENV)/.stamp
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-slow chaos check format bench clean
+.PHONY: help run test test-slow test-container chaos check format bench clean
 
 help:  ## List the verbs.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/'
@@ -23,9 +23,12 @@ run: $(STAMP)  ## Collect, train, collect again, evaluate: a small campaign, a f
 test: $(STAMP)  ## The tests, without the slow ones and chaos, in two processes.
 	$(BIN)/python -m pytest -q -m "not slow and not chaos" -n 2 --dist worksteal
 
-test-slow: $(STAMP)  ## The slow tests.
+test-slow: $(STAMP)  ## The slow tests, without those of containers.
 	@# Pytest ends with 5 where it selects no test, which is no failure of a suite that may be empty.
-	$(BIN)/python -m pytest -q -m slow || test $$? -eq 5
+	$(BIN)/python -m pytest -q -m "slow and not container" || test $$? -eq 5
+
+test-container: $(STAMP)  ## Build the image and run the services of docker-compose.yml by podman, ten minutes; needs root.
+	$(BIN)/python -m pytest -q -s -m container
 
 chaos: $(STAMP)  ## Kill campaigns at random moments and disturb every write step, about half an hour; SEED=N for others.
 	$(if $(SEED),ADAAFFORD_CHAOS_SEED=$(SEED)) $(BIN)/python -m pytest -q -m chaos

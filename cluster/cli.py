@@ -42,7 +42,7 @@ COMMANDS = {
     "curve": "how much trainings find out from stored tries, between Where2Act and an oracle",
     "status": "how a run or a store stands: rate, done, left, workers",
     "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
-    "store": "info, verify, digest, replay, repair, compact, merge, export or migrate: look after stores",
+    "store": "info, verify, digest, replay, repair, compact, merge, export, migrate or check-place: look after stores",
     "objects": "generate, check, preview or decompose: the objects",
     "bench": "fidelity, dynamics, collect, store, scale, learner, adapt or hints: how fast and how true each part is",
     "version": "print the version",

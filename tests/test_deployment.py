@@ -1,10 +1,16 @@
 """Files that deploy us pass validators, hold what they promise about safety, and give commands that exist.
 
-No engine runs here: docs/cluster.md says what was never run.
+No engine runs here: that is tests/containers.
 """
 
+import os
 import re
 import shlex
+import shutil
+import socket
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,11 +20,17 @@ import yaml
 from ray.scripts.scripts import start
 
 from cluster.commands import collect, learn
+from shared.errors import StoreError
+from shared.plan import Job, Plan
+from shared.store import Store, compact, repair, verify
+from tests.fabricate import fabricate_rollouts, fabricate_setting
 
 ROOT = Path(__file__).parents[1]
 COMPOSE = ROOT / "docker-compose.yml"
 KUBERAY = ROOT / "cluster" / "deploy" / "kuberay.yaml"
 PROMETHEUS = ROOT / "cluster" / "deploy" / "prometheus.yml"
+S3_INIT = ROOT / "cluster" / "deploy" / "s3-init.sh"
+S3_STAND_IN = ROOT / "tests" / "containers" / "s3" / "server.py"
 KUBERNETES = "1.33"
 OURS = {"head", "collector", "driver", "learner"}
 
@@ -165,3 +177,71 @@ def test_prometheus_looks_where_metrics_are(compose: dict[str, Any]) -> None:
     }
     assert set(found["names"]) == exporting == {"head", "collector", "driver"}
     assert found["port"] == 8080
+
+
+def test_images_are_named_by_version(compose: dict[str, Any]) -> None:
+    bases = re.findall(r"^FROM (\S+)", (ROOT / "Dockerfile").read_text(), flags=re.MULTILINE)
+    others = [service["image"] for name, service in compose["services"].items() if name not in OURS]
+    for image in [*bases, *others]:
+        name, _, tag = image.rpartition(":")
+        assert name and re.match(r"v?\d", tag), image
+
+
+def test_only_the_server_and_what_makes_keys_know_the_root_key(compose: dict[str, Any]) -> None:
+    knowing = {name for name, service in compose["services"].items() if "RUSTFS_SECRET_KEY" in repr(service)}
+    assert knowing == {"s3", "bucket"}
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as client:
+        return client.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.fixture
+def s3_with_keys(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Address of a server that checks rights; `s3-init.sh` made its bucket and the key that the environment names."""
+    if shutil.which("curl") is None:
+        pytest.skip("curl is not installed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    root = {"RUSTFS_ACCESS_KEY": "root", "RUSTFS_SECRET_KEY": "root's secret"}
+    ours = {
+        "S3_ENDPOINT": f"http://127.0.0.1:{port}",
+        "S3_BUCKET": "adaafford",
+        "S3_KEY": "ours",
+        "S3_SECRET": "secret",
+    }
+    server = {**os.environ, **root, "ADDRESS": "127.0.0.1", "PORT": str(port)}
+    with subprocess.Popen([sys.executable, str(S3_STAND_IN)], env=server, stderr=subprocess.DEVNULL) as process:
+        try:
+            while process.poll() is None and not listens(port):
+                time.sleep(0.05)
+            for _ in range(2):
+                subprocess.run(["sh", str(S3_INIT)], env={**os.environ, **root, **ours}, check=True)
+            for name in [name for name in os.environ if name.startswith("AWS_")]:
+                monkeypatch.delenv(name)
+            for name, value in (("ACCESS_KEY_ID", "ours"), ("SECRET_ACCESS_KEY", "secret"), ("REGION", "us-east-1")):
+                monkeypatch.setenv(f"AWS_{name}", value)
+            monkeypatch.setenv("AWS_ENDPOINT_URL", ours["S3_ENDPOINT"])
+            yield ours["S3_ENDPOINT"]
+        finally:
+            process.terminate()
+
+
+def test_the_rights_of_our_key_are_enough_for_a_store_and_for_nothing_else(
+    s3_with_keys: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    setting = fabricate_setting()
+    plan = Plan(setting=setting)
+    store = Store.create("s3://adaafford/store", setting)
+    for job in (Job(plan.key, 0, 2), Job(plan.key, 2, 4)):
+        store.commit(plan, job, fabricate_rollouts(plan, job), {})
+    compact(store, 4)
+    repair("s3://adaafford/store")
+    assert verify(store) == []
+    with pytest.raises(StoreError):
+        Store.create("s3://another/store", setting)
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
+    with pytest.raises(StoreError):
+        Store.open("s3://adaafford/store")

@@ -2,6 +2,8 @@
 
 import dataclasses
 import re
+import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,8 +15,9 @@ from shared.errors import StoreError, UsageError
 from shared.networks.configuration import NetworkConfig
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
-from shared.store import Store, info, verify
+from shared.store import Store, check_place, info, verify
 from shared.store.bucket import BucketPlace
+from shared.store.disk import DiskPlace
 from shared.store.place import Place, Publication, place_of
 from tests.fabricate import fabricate_rollouts, fabricate_setting, identical
 
@@ -243,3 +246,100 @@ def test_a_bucket_place_needs_no_locks(s3_url: str) -> None:
     place = BucketPlace.of(s3_url)
     with place.only_one("driver"), place.only_one("driver"):
         assert place.sweep(["", "shards"]) == 0
+
+
+def test_one_of_several_writers_wins_and_the_check_leaves_nothing_behind(place: Place) -> None:
+    check_place(place, writers=16, rounds=5)
+    assert place.leaves("") == []
+
+
+class ForgetsTheCondition(DiskPlace):
+    def create(self, key: str, data: bytes) -> bool:
+        self.replace(key, data)
+        return True
+
+
+class LooksAndThenWrites(DiskPlace):
+    """As servers do that read the condition, take the data, and write: with writers that all look before one writes."""
+
+    looked = threading.Barrier(4)
+
+    def create(self, key: str, data: bytes) -> bool:
+        found = self.exists(key)
+        if not found:
+            self.looked.wait()
+            self.replace(key, data)
+        return not found
+
+
+class KeepsTheLast(DiskPlace):
+    """Tells one writer that it won, and keeps what another wrote."""
+
+    def create(self, key: str, data: bytes) -> bool:
+        won = super().create(key, data)
+        if data[:1] == b"\x03":
+            self.replace(key, b"of another" * 10)
+        return won
+
+
+class ListsLate(DiskPlace):
+    def names(self, folder: str) -> list[str]:
+        return []
+
+
+class RemovesLater(DiskPlace):
+    def remove(self, key: str) -> None:
+        return
+
+
+class LosesAll(DiskPlace):
+    def create(self, key: str, data: bytes) -> bool:
+        super().create(key, data)
+        return False
+
+
+@pytest.mark.parametrize(
+    ("kind", "what"),
+    [
+        (ForgetsTheCondition, "4 of 4 concurrent writers of one new file were told that they made it"),
+        (LooksAndThenWrites, "4 of 4 concurrent writers"),
+        (LosesAll, "0 of 4 concurrent writers"),
+        (KeepsTheLast, "does not hold what its one successful writer wrote"),
+        (ListsLate, "not listed directly after it was written"),
+        (RemovesLater, "still there after it was removed"),
+    ],
+)
+def test_a_place_that_breaks_a_promise_is_found_out(
+    kind: Callable[[Path], DiskPlace], what: str, tmp_path: Path
+) -> None:
+    with pytest.raises(StoreError, match=f"{what}.*a bucket needs a server that obeys"):
+        check_place(kind(tmp_path), writers=4)
+
+
+def test_no_store_is_created_in_a_bucket_where_every_writer_wins(s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forgets(self: BucketPlace, key: str, data: bytes) -> bool:
+        self.replace(key, data)
+        return True
+
+    monkeypatch.setattr(BucketPlace, "create", forgets)
+    with pytest.raises(StoreError, match=r"8 of 8 concurrent writers .* could lose data"):
+        Store.create(s3_url, SETTING)
+    assert place_of(s3_url).leaves("") == []
+
+
+def test_check_place_prints_a_line(where: str, capsys: pytest.CaptureFixture[str]) -> None:
+    if "://" not in where:
+        assert run(["store", "check-place", where]) == 2
+        assert "there is no such folder" in capsys.readouterr().err
+        Path(where).mkdir()
+    assert run(["store", "check-place", where, "--rounds", "2"]) == 0
+    assert capsys.readouterr().out == f"{where}: no problems in 2 rounds of 16 concurrent writers\n"
+
+
+@pytest.mark.parametrize(("flag", "allowed"), [("--writers", "2 to 64"), ("--rounds", "1 to 10000")])
+@pytest.mark.parametrize("given", ["0", "-1", "1000000"])
+def test_check_place_refuses_numbers_out_of_bounds(
+    flag: str, allowed: str, given: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["store", "check-place", str(tmp_path), flag, given]) != 0
+    assert capsys.readouterr().err == f"adaafford: {flag} {given}: allowed: {allowed}\n"

@@ -1,4 +1,4 @@
-"""`adaafford store`: look into a store."""
+"""`adaafford store`: look into a store, or at the place where one shall be."""
 
 import faulthandler
 import json
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from shared.records import RolloutRecord
     from shared.store import Store
 
-ACTIONS = ("info", "verify", "digest", "replay", "repair", "compact", "merge", "export", "migrate")
+ACTIONS = ("info", "verify", "digest", "replay", "repair", "compact", "merge", "export", "migrate", "check-place")
+MOST_WRITERS, MOST_ROUNDS = 64, 10_000
 MOST_QUARANTINED = 20
 """Quarantined rollouts that `info` lists as text; `--json` lists all."""
 MOST_SHOWN = 20
@@ -78,6 +79,22 @@ class ReplayCommand:
     """Number of one rollout of the job."""
 
 
+@dataclass(frozen=True, slots=True)
+class CheckPlaceCommand:
+    """Check that of several concurrent writers of one new file exactly one wins, which commits rely on.
+
+    It needs no store and leaves nothing behind, so any server of buckets can be tried. Whatever creates a store in a
+    bucket does the same in 3 rounds of 8 writers.
+    """
+
+    place: Annotated[str, tyro.conf.Positional]
+    """A folder, or s3://BUCKET/PREFIX."""
+    rounds: int = 100
+    """Files that are written."""
+    writers: int = 16
+    """Concurrent writers of each file."""
+
+
 def main(args: list[str]) -> int:
     """Dispatch."""
     match args[:1]:
@@ -93,6 +110,8 @@ def main(args: list[str]) -> int:
             return _digest(parse_flags(DigestCommand, args[1:], "store digest"))
         case ["replay"]:
             return _replay(parse_flags(ReplayCommand, args[1:], "store replay"))
+        case ["check-place"]:
+            return _check_place(parse_flags(CheckPlaceCommand, args[1:], "store check-place"))
         case ["-h" | "--help"]:
             print(f"usage: adaafford store {{{','.join(ACTIONS)}}} STORE; `adaafford store info --help` tells more")
             return 0
@@ -254,3 +273,23 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _check_place(command: CheckPlaceCommand) -> int:
+    from shared.errors import StoreError
+    from shared.store import check_place
+    from shared.store.place import place_of
+
+    for name, given, most in (("writers", command.writers, MOST_WRITERS), ("rounds", command.rounds, MOST_ROUNDS)):
+        least = 2 if name == "writers" else 1
+        if not least <= given <= most:
+            raise UsageError(f"--{name} {given}: allowed: {least} to {most}")
+    place = place_of(command.place)
+    if not place.is_there():
+        raise UsageError(f"{command.place}: there is no such folder; make it, or name another")
+    try:
+        check_place(place, command.writers, command.rounds)
+    except OSError as error:
+        raise StoreError(f"{command.place}: cannot be used ({error.strerror}); name another place") from None
+    print(f"{place.where}: no problems in {command.rounds} rounds of {command.writers} concurrent writers")
+    return 0

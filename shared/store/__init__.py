@@ -1,6 +1,7 @@
 """The store: immutable shards, each complete if and only if its manifest is there."""
 
 from shared.store.compaction import Compaction, compact
+from shared.store.conformance import check_place
 from shared.store.export import Export, export
 from shared.store.info import StoreInfo, Tally, info
 from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
@@ -27,6 +28,7 @@ __all__ = [
     "Store",
     "StoreInfo",
     "Tally",
+    "check_place",
     "compact",
     "export",
     "info",

@@ -20,6 +20,7 @@ from shared.files import TEMPORARY_PREFIX
 from shared.plan import Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import policies, reader
+from shared.store.conformance import check_place
 from shared.store.coverage import Part, parts_of
 from shared.store.difference import difference_of
 from shared.store.digest import combined_digest
@@ -83,7 +84,8 @@ class Store:
             more: fields that newer software wrote into the description of the store that this one is a copy of.
 
         Raises:
-            StoreError: a store of another setting is there, or files that are no store, or it cannot be made.
+            StoreError: a store of another setting is there, or files that are no store, or it cannot be made, or the
+                bucket's server lets several writers of one key win.
             UsageError: the setting's seed is too large to be stored, or the URL is not allowed.
         """
         if setting.seed > MAX_SEED:
@@ -92,6 +94,9 @@ class Store:
         try:
             if not place.exists(STORE_FILE):
                 _refuse_foreign(place)
+                if place.writes_in_place:
+                    # Only what a server promises keeps two writers of a shard apart there; some break it.
+                    check_place(place)
                 created = datetime.now(UTC).isoformat(timespec="seconds")
                 known = {"setting": setting, "software": store_software(), "created": created}
                 document = StoreDocument.model_validate(dict(more or {}) | known, extra="allow")
