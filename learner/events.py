@@ -23,21 +23,18 @@ class EventFiles:
     """
 
     def __init__(self, folder: Path, step: int) -> None:
-        self._writer: Any = None
+        self._path: Path | None = None
         if find_spec("tensorboard") is not None:
             from tensorboard.compat.proto.event_pb2 import SessionLog
-            from tensorboard.summary.writer.record_writer import RecordWriter
 
             folder.mkdir(parents=True, exist_ok=True)
-            path = folder / f"events.out.tfevents.{time.time_ns()}.{os.getpid()}"
-            self._file = path.open("wb")
-            self._writer = RecordWriter(self._file)
+            self._path = folder / f"events.out.tfevents.{time.time_ns()}.{os.getpid()}"
             self._write(file_version=_VERSION)
             self._write(step=step + 1, session_log=SessionLog(status=SessionLog.START))
 
     def add(self, step: int, figures: Mapping[str, Any]) -> None:
         """The figures of a step, each under the stage's name; what is no number is left out."""
-        if self._writer is None:
+        if self._path is None:
             return
         from tensorboard.compat.proto.summary_pb2 import Summary
 
@@ -47,14 +44,12 @@ class EventFiles:
             if isinstance(value, int | float) and name != "step"
         ]
         self._write(step=step, summary=Summary(value=values))
-        self._writer.flush()
-
-    def close(self) -> None:
-        """Write what is left."""
-        if self._writer is not None:
-            self._writer.close()
 
     def _write(self, **content: Any) -> None:
         from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.summary.writer.record_writer import RecordWriter
 
-        self._writer.write(Event(wall_time=time.time(), **content).SerializeToString())
+        assert self._path is not None
+        # An event is rare, so nothing is left open or unwritten whenever the process ends.
+        with self._path.open("ab") as file:
+            RecordWriter(file).write(Event(wall_time=time.time(), **content).SerializeToString())

@@ -163,8 +163,6 @@ class _Loop:
                 self._step()
                 report.update(self._standing())
         report.finish(self._standing(), self.cursor.best_step)
-        if self._viewer is not None:
-            self._viewer.close()
         self.stage.module.load_state_dict(self.best)
         self.stage.module.eval()
         cursor = self.cursor

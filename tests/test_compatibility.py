@@ -62,7 +62,7 @@ def edit(file: Path, **changes: Any) -> None:
 def add_column(shard: Path, file: str, name: str, values: list[Any]) -> None:
     """Add a column to a table of a shard, as newer software would have written it."""
     table = pq.read_table(shard / file)
-    pq.write_table(table.append_column(name, pa.array(values)), shard / file)
+    pq.write_table(table.append_column(name, pa.array(values)), shard / file, use_dictionary=False)
     data = (shard / file).read_bytes()
     manifest = unseal((shard / "manifest.json").read_bytes(), "manifest")
     manifest["files"][file] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
@@ -219,7 +219,7 @@ def test_a_column_that_was_added_later_has_its_default_in_older_shards(tmp_path:
     shard = shards_of(make(tmp_path / "store", 1))[0]
     added: tuple[Column[Any], ...] = (
         Column("weather", "", 0, "for this test", lambda _: "rain", content=False, default="unknown"),
-        Column("wind", "<f8", 3, "for this test", lambda _: [0.0] * 3, content=False, default=[1.0, 2.0, 3.0]),
+        Column("wind", "<f8", 3, "for this test", lambda _: [0.0] * 3, content=False, default=(1.0, 2.0, 3.0)),
     )
     columns: Any = (*ROLLOUT_COLUMNS, *added)
     table = read_table((shard / "rollouts.parquet").read_bytes(), columns, 1, "table")
@@ -238,7 +238,7 @@ def test_a_column_that_was_added_later_has_its_default_in_older_shards(tmp_path:
 
 def _with_nulls(file: Path, name: str, kind: Any, out: Path) -> bytes:
     table = pq.read_table(file).drop_columns([name])
-    pq.write_table(table.append_column(name, pa.nulls(len(table), kind)), out)
+    pq.write_table(table.append_column(name, pa.nulls(len(table), kind)), out, use_dictionary=False)
     return out.read_bytes()
 
 
@@ -260,7 +260,9 @@ def older(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         place = [column.name for column in ROLLOUT_COLUMNS].index("fidelity")
         fidelity = next(column for column in ROLLOUT_COLUMNS if column.name == "fidelity")
         sink = pa.BufferOutputStream()
-        pq.write_table(table.add_column(place, fidelity.field, pa.array(["fast"] * len(table))), sink)
+        pq.write_table(
+            table.add_column(place, fidelity.field, pa.array(["fast"] * len(table))), sink, use_dictionary=False
+        )
         manifest["points"] = manifest.pop("cloud_size")
         return files | {"rollouts.parquet": sink.getvalue().to_pybytes()}, manifest
 
@@ -275,7 +277,7 @@ def make_older(path: Path) -> str:
     digest = store.digest()
     for folder in shards_of(store):
         table = pq.read_table(folder / "rollouts.parquet").drop_columns(["fidelity"])
-        pq.write_table(table, folder / "rollouts.parquet")
+        pq.write_table(table, folder / "rollouts.parquet", use_dictionary=False)
         data = (folder / "rollouts.parquet").read_bytes()
         manifest = unseal((folder / "manifest.json").read_bytes(), "manifest")
         manifest["files"]["rollouts.parquet"] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}

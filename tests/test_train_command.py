@@ -34,6 +34,7 @@ from shared.errors import UsageError, WorkerError
 from shared.files import exclusive_lock
 from shared.plan import Job
 from shared.policy import POLICY_FILE, WEIGHTS_FILE
+from shared.redaction import without_places
 from shared.store.store import Store
 from tests.test_learner_data import fabricated_plan, fabricated_rollouts, make_store
 from tests.test_learner_training import FAST
@@ -123,7 +124,7 @@ def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, confi
     for stage in ("prior", "aap", "aip"):
         told = (tmp_path / stage / OUTPUT_FILE).read_text()
         assert f"'{stage}' for '{Store.open(store).setting.task}' is done" in told
-        assert set(told.splitlines()) <= set(lines)
+        assert set(told.splitlines()) <= {without_places(line, tmp_path / stage) for line in lines}
 
 
 def test_a_learner_that_is_killed_ends_the_stage(store: Path, config_file: Path, tmp_path: Path) -> None:
@@ -237,8 +238,8 @@ def stopped(store: Path, config_file: Path) -> Path:
         ("foreign", "not a checkpoint"),
         ("mis-shaped", "needs torch.float32"),
         ("not finite", "not finite"),
-        ("moments", "'0.exp_avg' is missing"),
-        ("older", "not a checkpoint of this version (epoch"),
+        ("moments", "'optimiser.0.exp_avg' is missing"),
+        ("older", "not a checkpoint of this version (cursor: epoch"),
         ("another run", "other data or settings; choose another --out"),
     ],
 )

@@ -59,7 +59,8 @@ class Column(Generic[Row]):
         description: for the schema.
         value: the cell of a row.
         content: whether it enters the content digest; what depends on the shard, on time or on other columns does not.
-        default: of a column that came after others, what rows hold that were written before; None for the first ones.
+        default: of a column that came after others, what rows hold that were written before (a tuple for a list); None
+            for the first ones.
             Such a column is no content, since older software could not compute the digest (docs/compatibility.md).
         allowed: the texts that there are; None: any that is printable.
         longest: characters of a text.

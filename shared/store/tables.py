@@ -141,12 +141,14 @@ def joined(tables: Sequence[Any], source: str) -> Any:
 
 def _read(data: bytes, columns: Columns, rows: int, source: str, names: Sequence[str] | None) -> Any:
     """Some columns, or all; texts as dictionaries, which do not grow by being repeated."""
-    file = _open(data, [column.name for column in columns if not column.dtype])
-    there, known = file.schema_arrow, {column.name for column in columns}
+    texts = [column.name for column in columns if not column.dtype and column.default is None]
+    file = _open(data, texts)
+    there = file.schema_arrow
     _check_columns(there, columns, source)
     wanted = [name for name in there.names if names is None or name in names]
-    if texts := [name for name in wanted if name not in known and pa.types.is_string(there.field(name).type)]:
-        file = _open(data, [*texts, *(column.name for column in columns if not column.dtype)])
+    if more := [name for name in wanted if pa.types.is_string(there.field(name).type)]:
+        # Of newer software, or added later, so that it was not known before whether the file has them.
+        file = _open(data, [*texts, *more])
     metadata = file.metadata
     if metadata.num_rows != rows or metadata.num_row_groups > 1:
         raise StoreError(f"{source}: {metadata.num_rows} rows; the manifest says {rows} rows: the file is foreign")
@@ -226,9 +228,12 @@ def _size_of_texts(cells: Any) -> int:
 
 @cache
 def _schema_when_read(columns: tuple[Column[Any], ...]) -> Any:
-    fields = [column.field for column in columns]
+    texts = pa.dictionary(pa.int32(), pa.string())
     return pa.schema(
-        [f if f.type != pa.string() else f.with_type(pa.dictionary(pa.int32(), pa.string())) for f in fields]
+        [
+            column.field.with_type(texts) if not column.dtype and column.default is None else column.field
+            for column in columns
+        ]
     )
 
 
