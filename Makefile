@@ -6,7 +6,7 @@ STAMP := $(VENV)/.stamp
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-slow test-container chaos check format bench clean
+.PHONY: help run test test-slow test-container sbom chaos check format bench clean
 
 help:  ## List the verbs.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/'
@@ -29,6 +29,10 @@ test-slow: $(STAMP)  ## The slow tests, without those of containers.
 
 test-container: $(STAMP)  ## Build the image and run the services of docker-compose.yml by podman, ten minutes; needs root.
 	$(BIN)/python -m pytest -q -s -m container
+
+sbom: $(STAMP)  ## List what is installed, with versions and licences, into build/sbom.json (CycloneDX).
+	mkdir -p build
+	$(BIN)/cyclonedx-py environment --output-reproducible --output-file build/sbom.json $(BIN)/python
 
 chaos: $(STAMP)  ## Kill campaigns at random moments and disturb every write step, about half an hour; SEED=N for others.
 	$(if $(SEED),ADAAFFORD_CHAOS_SEED=$(SEED)) $(BIN)/python -m pytest -q -m chaos
