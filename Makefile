@@ -6,7 +6,7 @@ STAMP := $(VENV)/.stamp
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-slow test-container sbom chaos check format bench clean
+.PHONY: help run test test-slow test-container exhaustive sbom chaos check format bench clean
 
 help:  ## List the verbs.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/'
@@ -21,7 +21,7 @@ run: $(STAMP)  ## Collect, train, collect again, evaluate: a small campaign, a f
 	$(BIN)/adaafford run --preset smoke --out runs/smoke
 
 test: $(STAMP)  ## The tests, without the slow ones and chaos, in two processes.
-	$(BIN)/python -m pytest -q -m "not slow and not chaos" -n 2 --dist worksteal
+	$(BIN)/python -m pytest -q -m "not slow and not chaos and not exhaustive" -n 2 --dist worksteal
 
 test-slow: $(STAMP)  ## The slow tests, without those of containers.
 	@# Pytest ends with 5 where it selects no test, which is no failure of a suite that may be empty.
@@ -29,6 +29,9 @@ test-slow: $(STAMP)  ## The slow tests, without those of containers.
 
 test-container: $(STAMP)  ## Build the image and run the services of docker-compose.yml by podman, ten minutes; needs root.
 	$(BIN)/python -m pytest -q -s -m container
+
+exhaustive: $(STAMP)  ## Twenty thousand hostile files, and every error at every step of reading, an hour or more.
+	$(BIN)/python -m pytest -q -s -m exhaustive
 
 sbom: $(STAMP)  ## List what is installed, with versions and licences, into build/sbom.json (CycloneDX).
 	mkdir -p build

@@ -1,6 +1,6 @@
 """Errors of a disk, a network or a server in reading a store: they end the command, and nothing is set aside or lost.
 
-Every error at every step is for the slow test; otherwise each command meets errors at some of its steps.
+Every error at every step is for the exhaustive tests; otherwise each command meets errors at some of its steps.
 """
 
 import shutil
@@ -144,7 +144,7 @@ def test_an_error_of_a_bucket_ends_the_command_and_harms_nothing(name: str, s3_u
     assert ended
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("kind", DISK_READ_FAULTS)
 def test_every_error_at_every_step_of_reading_a_disk_harms_nothing(kind: str, tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_every_error_at_every_step_of_reading_a_disk_harms_nothing(kind: str, tm
     print(f"{kind}: errors injected, and commands that ended: {counts}")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("kind", BUCKET_READ_FAULTS)
 def test_every_error_at_every_step_of_reading_a_bucket_harms_nothing(kind: str, s3_url: str, tmp_path: Path) -> None:
