@@ -12,13 +12,14 @@ from typing import Literal
 import numpy as np
 
 from collector.articulation import MIN_RANGE, ArticulatedObject
-from collector.decomposition import Decomposer, cache_folder
+from collector.decomposition import Decomposer
 from collector.files import short
 from collector.partnet import URDF_FILE, read_object, urdf_of
 from shared.configuration import Collision
 from shared.errors import ObjectError, UsageError
 from shared.files import read_named
 from shared.plan import ObjectRef
+from shared.private import cache_folder
 from shared.seeds import generator
 from shared.tasks import Task
 
@@ -141,7 +142,7 @@ def load_ref(path: Path, ref: ObjectRef, collision: Collision = "hulls") -> Arti
     loaded = _load(path / ref.id if urdf_of(path) is None else path.resolve(), path, ref)
     if collision == "hulls":
         return loaded
-    with Decomposer(cache_folder()) as decomposer:
+    with Decomposer(cache_folder("pieces")) as decomposer:
         return decomposer.decomposed(loaded)
 
 

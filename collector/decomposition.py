@@ -1,6 +1,6 @@
 """Convex decomposition of collision meshes, so that cavities stay open: by CoACD, once a mesh, cached by its content.
 
-    opened = Decomposer(cache_folder()).decomposed(target)
+    opened = Decomposer(cache_folder("pieces")).decomposed(target)
 
 The cache is shared by all processes of a machine. Its entries are checked like any file from outside: what is damaged
 or does not fit its mesh is computed again.
@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import os
 import signal
 import subprocess
 from collections.abc import Callable, Sequence
@@ -27,7 +26,6 @@ from collector.pieces import MAX_ENCODED_BYTES, decode, encode
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.files import read_bounded, remove_tree, write_atomically
 from shared.interpreter import PYTHON, own_environment
-from shared.private import private_folder
 
 LIMIT_S = 120.0
 """CPU time for one mesh; the largest of published objects take some 20 s."""
@@ -38,33 +36,6 @@ SLACK = 0.1
 """How far pieces may stand out of their mesh's bounding box: preprocessing thickens surfaces."""
 
 
-def cache_folder() -> Path:
-    """Where decompositions are kept: below $XDG_CACHE_HOME or ~/.cache, or else in this user's temporary folder.
-
-    Raises:
-        UsageError: none of them can be written.
-    """
-    # Without a home this gives "~", a relative path.
-    home = Path(os.environ.get("HOME", os.path.expanduser("~")))  # noqa: PTH111
-    for base in (Path(os.environ.get("XDG_CACHE_HOME", "")), home / ".cache"):
-        folder = base / "adaafford" / "pieces"
-        # The specification has relative paths ignored.
-        if folder.is_absolute() and _can_be_written(folder):
-            return folder
-    try:
-        return private_folder("pieces")
-    except UsageError as error:
-        raise UsageError(f"{error}, or XDG_CACHE_HOME to one for the cache of decomposed meshes") from None
-
-
-def _can_be_written(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK | os.X_OK)
-
-
 class Decomposer:
     """Decomposes objects; a context that ends the process it may have started.
 
@@ -72,7 +43,7 @@ class Decomposer:
         cache: folder of the cache; made where missing.
 
     Example:
-        >>> with Decomposer(cache_folder()) as decomposer:
+        >>> with Decomposer(cache_folder("pieces")) as decomposer:
         ...     opened = decomposer.decomposed(target)
     """
 

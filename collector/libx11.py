@@ -17,8 +17,8 @@ from functools import cache
 
 NAME = "libX11.so.6"
 
-_HEADERS = 64 + 2 * 56
-"""Bytes before the tables: the file's header and two program headers."""
+_HEADERS = 64 + 3 * 56
+"""Bytes before the tables: the file's header and three program headers."""
 _X86_64 = 62
 
 
@@ -62,8 +62,8 @@ def _load(content: bytes) -> None:
 def empty_library(name: str) -> bytes:
     """A shared library (ELF, x86-64) of that name which holds nothing.
 
-    It has two program headers, one that maps the file and one for its dynamic section, and the tables that the linker
-    insists on: strings, symbols (the empty one alone) and their hashes.
+    It has three program headers, which map the file, name its dynamic section and say that no stack is executed, and the
+    tables that the linker insists on: strings, symbols (the empty one alone) and their hashes.
     """
     strings = b"\0" + name.encode() + b"\0"
     symbols = bytes(24)
@@ -86,7 +86,9 @@ def empty_library(name: str) -> bytes:
         *(0, 0),
     )
     identity = b"\x7fELF" + bytes([2, 1, 1]) + bytes(9)  # 64 bits, little-endian, version 1.
-    header = identity + struct.pack("<HHIQQQIHHHHHH", 3, _X86_64, 1, 0, 64, 0, 0, 64, 56, 2, 64, 0, 0)
+    header = identity + struct.pack("<HHIQQQIHHHHHH", 3, _X86_64, 1, 0, 64, 0, 0, 64, 56, 3, 64, 0, 0)
     load = struct.pack("<IIQQQQQQ", 1, 6, 0, 0, 0, end, end, 0x1000)
     section = struct.pack("<IIQQQQQQ", 2, 6, at_dynamic, at_dynamic, at_dynamic, len(dynamic), len(dynamic), 8)
-    return header + load + section + symbols + hashes + dynamic + strings
+    # Without this header, a stack that can be executed is asked for, which newer systems refuse.
+    stack = struct.pack("<IIQQQQQQ", 0x6474E551, 6, 0, 0, 0, 0, 0, 16)
+    return header + load + section + stack + symbols + hashes + dynamic + strings

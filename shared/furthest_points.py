@@ -6,7 +6,7 @@ several points that are equally far, the one that comes first in the tree is tak
 `bucket_fps_kdline_sampling` of the package fpsample, which has no wheels for Python 3.13 and later. So stores that were
 made with that package keep their digests.
 
-Numba compiles this module at its first call and keeps the machine code beside this file, or in the user's cache folder.
+Numba compiles this module at its first call and keeps the machine code in the user's cache folder.
 Sums of floating-point numbers are neither reordered nor fused, so the result does not depend on the processor.
 
 Shapes: N points, L leaves, K samples.
@@ -16,14 +16,17 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import config, njit
 from numpy.typing import NDArray
 
+from shared.errors import UsageError
+from shared.private import cache_folder
 from shared.vocabulary import Float32
 
 TREE_HEIGHT = 5
 """The leaves are 2 to the power of this. It decides which of equally far points is taken, so it is part of the data."""
 
+_SETTINGS: Any = config
 _FURTHEST = np.float32(np.finfo(np.float32).max)
 
 
@@ -45,10 +48,15 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., An
     """Compile a function at its first call; keep the machine code where that is possible."""
 
     def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+        before = _SETTINGS.CACHE_DIR
         try:
+            # Without a home, Numba's own choice would be a folder called "~" wherever the process happens to be.
+            _SETTINGS.CACHE_DIR = before or str(cache_folder("numba"))
             kept: Callable[..., Any] = njit(function, cache=True, nogil=True, **options)
-        except RuntimeError:  # Neither this folder nor the user's cache folder can be written.
+        except (RuntimeError, UsageError):  # There is no place that can be written.
             kept = njit(function, nogil=True, **options)
+        finally:
+            _SETTINGS.CACHE_DIR = before
         return kept
 
     return compiled

@@ -3,7 +3,7 @@
 TMP/adaafford-<user id>/         mode 0700
     ray/<session>/               a Ray session's sockets and logs, as long as its driver lives
     underway-<hash>/             crash logs of workers on a bucket's store
-    pieces/                      decomposed meshes, where there is no cache folder
+    pieces/, numba/              decomposed meshes and compiled functions, where there is no cache folder
 """
 
 import os
@@ -42,6 +42,33 @@ def private_folder(name: str) -> Path:
         f"there is no place for temporary files of this user alone ({'; '.join(refusals)}); "
         f"set TMPDIR to a folder that you may write to, of at most {LONGEST - len(own.name) - 1} letters"
     )
+
+
+def cache_folder(name: str) -> Path:
+    """The folder `name` of our caches: below $XDG_CACHE_HOME or ~/.cache, or else in this user's temporary folder.
+
+    Raises:
+        UsageError: none of them can be written.
+    """
+    # Without a home this gives "~", a relative path.
+    home = Path(os.environ.get("HOME", os.path.expanduser("~")))  # noqa: PTH111
+    for base in (Path(os.environ.get("XDG_CACHE_HOME", "")), home / ".cache"):
+        folder = base / "adaafford" / name
+        # The specification has relative paths ignored.
+        if folder.is_absolute() and _can_be_written(folder):
+            return folder
+    try:
+        return private_folder(name)
+    except UsageError as error:
+        raise UsageError(f"{error}, or XDG_CACHE_HOME to one for caches") from None
+
+
+def _can_be_written(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
 
 
 def _refusal(own: Path) -> str | None:

@@ -219,7 +219,8 @@ def test_the_table_has_a_row_for_every_method(trained: Path, tmp_path: Path) -> 
     assert all(row.trials == 3 for (name, budget), row in table.items() if budget == 4)
     assert table[ORACLE_METHOD, 0].trials == table[NO_TRIES_METHOD, 0].trials == 0
     # All methods made the same tries: those that share critic and policy agree, and no others.
-    assert table["ours-fps", 4].bce == table["ours-final", 4].bce
+    # Up to rounding, since some builds of PyTorch sum a row of a batch according to its place.
+    assert table["ours-fps", 4].bce == pytest.approx(table["ours-final", 4].bce, rel=1e-6)
     different = ("ours-final", "ours-no-iteration", *BASELINES)
     assert len({table[name, 4].bce for name in different}) == len(different)
 

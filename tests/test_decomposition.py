@@ -14,13 +14,14 @@ import pytest
 from collector import decomposition, meshes
 from collector.articulation import ArticulatedObject, Mesh
 from collector.catalogue import load_ref, scan
-from collector.decomposition import Decomposer, cache_folder
+from collector.decomposition import Decomposer
 from collector.pieces import decode, encode
 from collector.procedural import generate
 from collector.scene import Scene
 from shared.configuration import FIDELITIES
 from shared.errors import ObjectError, UsageError
 from shared.geometry import gripper_rotation
+from shared.private import cache_folder
 from shared.vocabulary import HiddenDynamics, Primitive
 from tests.single_door import drawer
 
@@ -159,13 +160,13 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
 def test_the_cache_is_where_the_user_keeps_caches(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / "adaafford/pieces"
+    assert cache_folder("pieces") == tmp_path / "adaafford/pieces"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / ".cache/adaafford/pieces"
+    assert cache_folder("pieces") == tmp_path / ".cache/adaafford/pieces"
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert cache_folder() == tmp_path / ".cache/adaafford/pieces"
+    assert cache_folder("pieces") == tmp_path / ".cache/adaafford/pieces"
 
 
 @pytest.mark.parametrize("home", ["a file", "unset", "empty", "relative"])
@@ -183,13 +184,13 @@ def test_without_a_home_decompositions_are_kept_among_temporary_files_of_this_us
         monkeypatch.setattr("pwd.getpwuid", nobody)
     with tempfile.TemporaryDirectory(prefix="", dir="/tmp") as folder:
         monkeypatch.setenv("TMPDIR", folder)
-        assert cache_folder() == Path(folder) / f"adaafford-{os.geteuid()}" / "pieces"
-        with Decomposer(cache_folder()) as decomposer:
+        assert cache_folder("pieces") == Path(folder) / f"adaafford-{os.geteuid()}" / "pieces"
+        with Decomposer(cache_folder("pieces")) as decomposer:
             assert len(decomposer.pieces(ell())) > 1
         monkeypatch.delenv("TMPDIR")
         monkeypatch.setattr("shared.private._TEMPORARY", (str(tmp_path / "missing"),))
-        with pytest.raises(UsageError, match=r"set TMPDIR to a folder .*, or XDG_CACHE_HOME to one for the cache"):
-            cache_folder()
+        with pytest.raises(UsageError, match=r"set TMPDIR to a folder .*, or XDG_CACHE_HOME to one for caches"):
+            cache_folder("pieces")
 
 
 def test_a_setting_decides_what_is_loaded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

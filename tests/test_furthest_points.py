@@ -1,6 +1,12 @@
 """Furthest-point sampling: each sample is the furthest there is, and ties go as they always went."""
 
 import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,3 +60,20 @@ def test_furthest_points_that_are_equally_far_come_in_the_order_of_stored_data(
         points = np.round(points * steps) / steps
     chosen = furthest_points(points.astype(np.float32), count)
     assert hashlib.sha256(chosen.astype("<i8").tobytes()).hexdigest()[:16] == digest
+
+
+def test_compiled_code_is_kept_in_the_cache_of_the_user_and_nowhere_without_a_home(tmp_path: Path) -> None:
+    script = "import numpy; from shared.furthest_points import furthest_points as f; f(numpy.eye(3, dtype='f4'), 2)"
+    here, cache, temporary = tmp_path / "here", tmp_path / "cache", Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))
+    here.mkdir()
+    base = {name: value for name, value in os.environ.items() if name not in ("HOME", "XDG_CACHE_HOME")}
+    base |= {"PYTHONPATH": str(Path(__file__).parents[1]), "TMPDIR": str(temporary)}
+    for more in ({"XDG_CACHE_HOME": str(cache)}, {"HOME": "~"}):
+        done = subprocess.run(
+            [sys.executable, "-c", script], env=base | more, cwd=here, capture_output=True, text=True, check=False
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+    assert list(cache.rglob("*.nbi"))
+    assert list(temporary.rglob("*.nbi"))
+    assert list(here.iterdir()) == []
+    shutil.rmtree(temporary)

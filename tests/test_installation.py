@@ -1,6 +1,7 @@
 """What users install: wheels alone, a core without simulator and cluster, and one line where an extra is missing."""
 
 import json
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -128,7 +129,13 @@ def test_the_core_adapts_and_trains_in_an_empty_environment(tmp_path: Path) -> N
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    call(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, ROOT)
+    # From a copy: setuptools leaves a folder behind, from which a later build would take files that are gone here.
+    source = tmp_path / "source"
+    for package in ("adaafford", "shared", "collector", "learner", "cluster"):
+        shutil.copytree(ROOT / package, source / package)
+    for file in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / file, source)
+    call(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, source)
     (wheel,) = tmp_path.glob("adaafford-*.whl")
     call(sys.executable, "-m", "venv", "new")
     python, adaafford = tmp_path / "new" / "bin" / "python", tmp_path / "new" / "bin" / "adaafford"

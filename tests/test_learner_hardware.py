@@ -106,5 +106,4 @@ def test_without_tensorboard_nothing_is_written(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr("learner.events.find_spec", lambda name: None)
     viewer = EventFiles(tmp_path / "events", 0)
     viewer.add(1, {"stage": "line", "score": 1.0})
-    viewer.close()
     assert not (tmp_path / "events").exists()

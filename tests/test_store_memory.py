@@ -33,6 +33,7 @@ COMMANDS: dict[str, Callable[[Store, Path], object]] = {
 }
 
 
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_memory_hardly_grows_with_the_number_of_shards(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -4,8 +4,10 @@ import importlib.util
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from shared.errors import UsageError, WorkerError
 from shared.interpreter import PYTHON, own_environment
@@ -18,16 +20,26 @@ def serve() -> None:
     import logging
     import urllib.request
 
-    from moto.server import ThreadedMotoServer
+    from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
+    from werkzeug.serving import make_server
+
+    moto, writing = DomainDispatcherApplication(create_backend_app), threading.Lock()
+
+    def one_writer(environ: Any, start_response: Any) -> Any:
+        """Answer a request. Moto looks whether a file is there and makes it in two steps, so one writer at a time."""
+        if environ["REQUEST_METHOD"] == "GET":
+            return moto(environ, start_response)
+        with writing:
+            return moto(environ, start_response)
 
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    urllib.request.urlopen(urllib.request.Request(f"http://{host}:{port}/{BUCKET}", method="PUT")).close()
-    print(port, flush=True)
+    server = make_server("127.0.0.1", 0, one_writer, threaded=True)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    request = urllib.request.Request(f"http://127.0.0.1:{server.port}/{BUCKET}", method="PUT")
+    urllib.request.urlopen(request).close()
+    print(server.port, flush=True)
     sys.stdin.read()
-    server.stop()
+    server.shutdown()
 
 
 @contextmanager

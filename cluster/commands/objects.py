@@ -183,11 +183,12 @@ def _decompose(command: DecomposeCommand) -> int:
     from rich.progress import Progress, TaskID
 
     from collector.catalogue import load, scan
-    from collector.decomposition import Decomposer, cache_folder
+    from collector.decomposition import Decomposer
     from shared.errors import ObjectError
+    from shared.private import cache_folder
 
     usable, failed = scan(command.path).usable, 0
-    with Decomposer(cache_folder()) as decomposer, Progress(transient=True) as bar:
+    with Decomposer(cache_folder("pieces")) as decomposer, Progress(transient=True) as bar:
         for number, entry in enumerate(usable, start=1):
             task = bar.add_task(f"{entry.ref.id} ({number} of {len(usable)})", total=None)
 
@@ -204,7 +205,7 @@ def _decompose(command: DecomposeCommand) -> int:
                 meshes, pieces = (sum(len(body.collisions) for body in o.bodies) for o in (target, opened))
                 _say(bar.console, f"{entry.ref.id}  {meshes} meshes, {pieces} convex pieces")
             bar.remove_task(task)
-    print(f"{len(usable) - failed} decomposed into {cache_folder()}, {failed} refused")
+    print(f"{len(usable) - failed} decomposed into {cache_folder('pieces')}, {failed} refused")
     return 0 if failed < len(usable) else UsageError.exit_code
 
 
