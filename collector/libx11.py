@@ -62,8 +62,8 @@ def _load(content: bytes) -> None:
 def empty_library(name: str) -> bytes:
     """A shared library (ELF, x86-64) of that name which holds nothing.
 
-    It has three program headers, which map the file, name its dynamic section and say that no stack is executed, and the
-    tables that the linker insists on: strings, symbols (the empty one alone) and their hashes.
+    It has three program headers, which map the file, name its dynamic section and say that no stack is executed. It has
+    the tables that the linker insists on: strings, symbols (the empty one alone) and their hashes.
     """
     strings = b"\0" + name.encode() + b"\0"
     symbols = bytes(24)
