@@ -59,6 +59,8 @@ def header_lines(data: bytes) -> Iterator[tuple[list[str], int]]:
     while (end := data.find(ending, start, MAX_HEADER_BYTES)) >= 0:
         yield [word.decode("latin-1") for word in data[start:end].split()], end + 1
         start = end + 1
+    if len(data) <= MAX_HEADER_BYTES:
+        raise ValueError(f"is cut off: its {len(data)} bytes end before its header does")
     raise ValueError(f"its header does not end within {MAX_HEADER_BYTES} bytes")
 
 
@@ -86,9 +88,12 @@ def numbers_of(text: bytes, start: int, most: int) -> tuple[Float, str]:
     while start < len(text) and held < most:
         space = _SPACE.search(text, start + _PIECE_BYTES)
         end = len(text) if space is None else space.start()
-        words = text[start:end].split()[: most - held]
+        piece = text[start:end]
+        words = piece.split()[: most - held]
+        # Without an underscore, which is rare, Python's own reading will do and is faster.
+        reading = number_of if b"_" in piece else float
         try:
-            values[held : held + len(words)] = np.fromiter(map(float, words), dtype=np.float64, count=len(words))
+            values[held : held + len(words)] = np.fromiter(map(reading, words), dtype=np.float64, count=len(words))
         except ValueError:
             for word in words:
                 number = _number(word)
@@ -100,6 +105,13 @@ def numbers_of(text: bytes, start: int, most: int) -> tuple[Float, str]:
             held += len(words)
         start = end
     return values[:held], ""
+
+
+def number_of(word: bytes) -> float:
+    """The number that a word in text is; Python alone would read 0.9_3 as 0.93."""
+    if b"_" in word:
+        raise ValueError(f"{shown([word.decode('latin-1')])!r} is no number")
+    return float(word)
 
 
 def too_few(announced: int, held: int, what: str, word: str = "") -> ValueError:
@@ -135,6 +147,6 @@ def cloud_of(names: Sequence[str], column: Callable[[int], NDArray[np.generic]])
 
 def _number(word: bytes) -> float | None:
     try:
-        return float(word)
+        return number_of(word)
     except ValueError:
         return np.nan if _NOT_FINITE.fullmatch(word) else None

@@ -15,6 +15,7 @@ interaction without an outcome is a proposal that nobody has tried yet.
 
 import json
 import os
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, TypeVar
@@ -30,6 +31,8 @@ from shared.vocabulary import Action, Interaction, Observation, Outcome, Outcome
 
 MAX_HISTORY_BYTES = 1 << 20
 MAX_TRIES = 64
+MAX_NAME = 1000
+"""Characters of a scan's path."""
 SUCCESS_MOTION = 0.01
 """Motion that counts as a success unless it is said otherwise: tau, rad or m, as published."""
 
@@ -37,13 +40,20 @@ SUCCESS_MOTION = 0.01
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def _printable(name: str) -> str:
-    if not name.isprintable():
-        raise ValueError("needs a name without control characters")
+def scan_name(name: str) -> str:
+    """The name of a scan, given back where a history can hold it.
+
+    Raises:
+        ValueError: it is empty or too long, or holds a control character or what is not UTF-8.
+    """
+    if not 1 <= len(name) <= MAX_NAME:
+        raise ValueError(f"needs a name of 1 to {MAX_NAME} characters; given {len(name)}")
+    if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in name):
+        raise ValueError("needs a name without control characters, in UTF-8")
     return name
 
 
-ScanName = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
+ScanName = Annotated[str, AfterValidator(scan_name)]
 """The path of a cloud's file."""
 
 

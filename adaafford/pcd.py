@@ -17,6 +17,7 @@ from adaafford.columns import (
     Columns,
     cloud_of,
     header_lines,
+    number_of,
     numbers_of,
     shown,
     too_few,
@@ -95,7 +96,8 @@ def _fields(header: dict[str, list[str]]) -> list[_Field]:
         raise ValueError("its FIELDS, SIZE, TYPE and COUNT differ in length")
     fields = []
     for name, size, kind, count in zip(names, sizes, kinds, counts, strict=True):
-        if kind + size not in _SCALARS:
+        # The Point Cloud Library reads types in either case.
+        if kind.upper() + size not in _SCALARS:
             raise ValueError(f"its field {shown([name])!r} is of TYPE {shown([kind])!r} and SIZE {shown([size])!r}")
         fields.append(_Field(name, f"<{kind.lower()}{size}", whole_number(count, f"the COUNT of {shown([name])!r}")))
         if name in KNOWN and fields[-1].count != 1:
@@ -116,7 +118,7 @@ def _points(header: dict[str, list[str]]) -> int:
 
 def _viewpoint(words: list[str]) -> NDArray[np.float64]:
     try:
-        return np.array([float(word) for word in words[:3]])
+        return np.array([number_of(word.encode("latin-1")) for word in words[:3]])
     except ValueError:
         raise ValueError(f"its VIEWPOINT is {shown(words)!r}, which are no numbers") from None
 

@@ -28,6 +28,8 @@ _KINDS = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+    # Of no standard, but trimesh writes them.
+    **{"int64": "i8", "uint64": "u8", "float16": "f2"},
 }
 _MAX_ELEMENTS, _MAX_PROPERTIES = 64, 1024
 _FIRST_RUN = 64

@@ -47,6 +47,8 @@ _MISSING_SHARE = 0.1
 """What a depth camera misses without anybody being told."""
 _STEEP_DEG = 80.0
 """Training saw objects from 30 to 60 deg above."""
+_OFF_LEVEL_DEG = 30.0
+"""A camera sees what lies within 60 deg of the axis that it looks along."""
 
 _SILENT = np.errstate(invalid="ignore", over="ignore")
 """NumPy warns where it meets certain bits of NaN, and where a number is infinite as a double."""
@@ -172,6 +174,8 @@ def read_scan_file(path: Path) -> bytes:
 @_SILENT
 def parse_scan(data: bytes, path: Path) -> Scan:
     """A cloud from the bytes of its file; raises as `read_scan` does."""
+    if not data:
+        raise UsageError(f"{path}: is empty; export it again")
     try:
         columns = READERS[path.suffix.lower()](without_mark(data))
     except ValueError as error:
@@ -253,15 +257,17 @@ def doubtful_up(scan: Scan, frame: ScanFrame) -> str | None:
     """
     place = frame.to_world([frame.camera])[0]
     elevation = float(np.rad2deg(np.arctan2(place[2], np.hypot(place[0], place[1]))))
-    x, y, z = np.abs(scan.points[:, 0]), np.abs(scan.points[:, 1]), scan.points[:, 2]
-    ahead = frame.camera == (0.0, 0.0, 0.0) and frame.up == (0.0, 0.0, 1.0) and bool((np.maximum(x, y) < z).all())
-    if abs(elevation) <= _STEEP_DEG and not ahead:
+    sight = frame.origin[2] - frame.camera[2]
+    along_z = bool((scan.points[:, 2] * sight > 0).all())
+    camera_frame = frame.camera == (0.0, 0.0, 0.0) and frame.up == (0.0, 0.0, 1.0) and along_z
+    if abs(elevation) <= (_OFF_LEVEL_DEG if camera_frame else _STEEP_DEG):
         return None
     side = "above" if elevation > 0 else "below"
     up = " ".join(f"{value:g}" for value in frame.up)
+    axes, probable = ("y down, z forward", "0 -1 0") if sight > 0 else ("y up, z backward", "0 1 0")
     return (
         f"with up {up} the camera stands {abs(elevation):.0f} deg {side} the object; in a camera's own frame (x right, "
-        "y down, z forward) up is probably 0 -1 0"
+        f"{axes}) up is probably {probable}"
     )
 
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from adaafford.heatmaps import heatmap_writer, write_heatmap
-from adaafford.histories import History, ScanName, TriedOutcome, parse_json, read_history, write_history
+from adaafford.histories import History, ScanName, TriedOutcome, parse_json, read_history, scan_name, write_history
 from adaafford.scans import (
     POINTS,
     Scan,
@@ -31,6 +31,7 @@ from shared import seeds
 from shared.adaptation import Adapter
 from shared.configuration import StrictModel
 from shared.errors import UsageError
+from shared.plain import plain
 from shared.policy import Policy
 from shared.proposers import AipProposer, ExploitProposer
 from shared.vocabulary import Observation
@@ -179,7 +180,7 @@ class Session:
         scan = parse_scan(data, path)
         frame = ScanFrame.around(scan, self._up or (0.0, 0.0, 1.0), self._camera)
         if self._up is None and (doubt := doubtful_up(scan, frame)):
-            self._tell(f"{path}: {doubt}; if so, say it (--up 0 -1 0) and begin another history")
+            self._tell(f"{path}: {doubt}; if so, say it by --up and begin another history")
         self._remember(scan, path, sha256, frame)
         return History(frame=frame)
 
@@ -188,11 +189,15 @@ class Session:
         folder = os.path.realpath(self._files.history.parent)
         try:
             # Of a loop of links pathlib would raise; reading refuses it.
-            return Path(os.path.realpath(cloud)).relative_to(folder).as_posix()
+            name = Path(os.path.realpath(cloud)).relative_to(folder).as_posix()
         except ValueError:
             raise UsageError(
                 f"{cloud}: does not lie beside the history or below; put it into {folder}, so that both stay together"
             ) from None
+        try:
+            return scan_name(name)
+        except ValueError as error:
+            raise UsageError(f"{plain(name)}: {error}; rename the scan") from None
 
     def _observe(self, name: str, wanted: str | None, frame: ScanFrame) -> tuple[Observation, str]:
         """The observation of a cloud's file, and the file's hash.

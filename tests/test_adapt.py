@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -364,6 +365,36 @@ def test_misuse_is_refused_and_changes_nothing(policy_folder: Path, scan: Path, 
         with pytest.raises(UsageError, match="there is no such file"):
             session(policy_folder, scan).step(scan.parent / name)
     assert (scan.parent / "history.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["scan\u202f1.npz", "scan\u00a01.npz", "scan\u30001.npz", "\u03b4\u200d.npz"])
+def test_a_scan_may_have_any_name_that_can_be_read(name: str, policy_folder: Path, scan: Path) -> None:
+    named = scan.rename(scan.with_name(name))
+    session(policy_folder, named).step(named)
+    assert [each.cloud for each in read_history(scan.parent / "history.json").interactions] == [name]
+    assert session(policy_folder, named).step(named, TriedOutcome(motion=0.2)).tries == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        (os.fsdecode(b"scan\xff.npz"), "scan\\udcff.npz: needs a name without control characters, in UTF-8"),
+        ("x\x1b[31my.npz", "x\\x1b[31my.npz: needs a name without control characters"),
+        ("x\ny.npz", "x\\ny.npz: needs a name without control characters"),
+        ("/".join(["d" * 200] * 5) + "/scan.npz", "needs a name of 1 to 1000 characters; given 1013"),
+    ],
+)
+def test_a_name_that_a_history_cannot_hold_is_refused_before_any_work(
+    name: str, expected: str, policy_folder: Path, scan: Path
+) -> None:
+    named = scan.parent / name
+    named.parent.mkdir(parents=True, exist_ok=True)
+    scan.rename(named)
+    with pytest.raises(UsageError) as refused:
+        session(policy_folder, scan).step(named)
+    assert expected in str(refused.value)
+    assert str(refused.value).isprintable()
+    assert not [path for path in scan.parent.iterdir() if path.stem in ("history", "heatmap")]
 
 
 def test_names_too_long_for_the_disk_are_refused(policy_folder: Path, scan: Path) -> None:

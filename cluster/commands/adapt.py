@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from cluster.settings import parse_flags
 from shared.errors import AdaAffordError, UsageError
+from shared.plain import plain
 from shared.vocabulary import OutcomeKind
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def lines_of(stream: BinaryIO) -> Iterator[bytes]:
 
 
 def _say(line: str) -> None:
-    print(f"adaafford: {line}", file=sys.stderr, flush=True)
+    print(f"adaafford: {plain(line)}", file=sys.stderr, flush=True)
 
 
 def _follow(session: "Session", folder: Path) -> None:
