@@ -89,6 +89,9 @@ def scan(path: Path, *object_lists: Path) -> Catalogue:
     folders = _object_folders(path)
     if object_lists:
         listed = dict.fromkeys(object_id for each in object_lists for object_id in read_list(each))
+        if not listed:
+            names = ", ".join(str(each) for each in object_lists)
+            raise UsageError(f"{names}: names no object; name a list of '<id> <category>' lines")
         folders = {object_id: folders.get(object_id, path / object_id) for object_id in listed}
     elif all(urdf_of(folder) is None for folder in folders.values()):
         raise UsageError(f"{path}: holds no object; name a folder of <id>/{URDF_FILE}, or one <id> itself")

@@ -1,13 +1,21 @@
 """Reading the files of an object's folder, which came from outside: regular, small enough, and in their place."""
 
 import os
+import re
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 from shared.errors import ObjectError
 
-CACHES = ("blobs", ".git/annex/objects", ".dvc/cache")
-"""Where a model hub's client, git-annex and DVC keep the contents of files that they show as links."""
+_GITFILE = b"gitdir: "
+_MOST_GITFILE = 4096
+# What stands in a file whose contents were not downloaded, and the command that gets them. Where links cannot be made,
+# git-annex writes the path that the link would have.
+_POINTERS = (
+    (re.compile(rb"version https://git-lfs\.github\.com/spec/"), "Git LFS", "git lfs pull"),
+    (re.compile(rb"(?:[./]*\.git\S*)?/annex/objects/"), "git-annex", "git annex get"),
+)
 
 
 def short(text: object, length: int = 80) -> str:
@@ -19,9 +27,9 @@ def short(text: object, length: int = 80) -> str:
 class ObjectFiles:
     """The files below one object's folder.
 
-    Files may be links, as in the cache of a download, but only to files below the object's folder, below the tree of
-    objects that the user named, or in the cache that this tree is part of (`CACHES`): the folder may come from anybody,
-    and no file elsewhere on this machine is any of its business.
+    Files may be links, but only to files below the object's folder, below the tree of objects that the user named, or
+    in the cache of a download that this tree is part of (`_caches`): the folder may come from anybody, and no file
+    elsewhere on this machine is any of its business.
 
     Args:
         folder: of the object, or a link to it.
@@ -38,8 +46,9 @@ class ObjectFiles:
         self.folder = folder
         own = folder.resolve()
         top = own if tree is None else tree.resolve()
-        caches = [above / name for above in top.parents for name in CACHES if _keeps(above, name, top)]
-        self._roots = (own, top, *caches)
+        # What an object brings along is not trusted to be a cache.
+        within = top.parents if top == own else (top, *top.parents)
+        self._roots = (own, top, *(cache for above in within for cache in _caches(above, top)))
 
     def exists(self, name: str) -> bool:
         """Whether there is something called `name`, if only a link that leads nowhere."""
@@ -56,7 +65,8 @@ class ObjectFiles:
         """The bytes of the file called `name`, a path relative to the folder.
 
         Raises:
-            ObjectError: it is missing, no regular file, out of its place, unreadable or over `most_bytes`.
+            ObjectError: it is missing, no regular file, out of its place, unreadable, over `most_bytes`, or stands for
+                contents that were not downloaded.
         """
         path = self._path(name)
         try:
@@ -66,13 +76,25 @@ class ObjectFiles:
                     f"{self.folder}: {short(name)} is a link that leads out of the folder of objects, so it is not "
                     "followed; if you trust it, copy the objects with their links followed (`cp -rL FROM TO`)"
                 )
-            return self._read(resolved, name, most_bytes)
+            data = self._read(resolved, name, most_bytes)
         except FileNotFoundError:
-            what = "is a link to a file that is not there" if path.is_symlink() else "is missing"
-            raise ObjectError(f"{self.folder}: {short(name)} {what}; docs/objects.md has the layout") from None
+            what = "is missing; docs/objects.md has the layout"
+            if path.is_symlink():
+                what = (
+                    "is a link to a file that is not there, so the download is not complete; get its contents "
+                    "(`git annex get`, `dvc pull`)"
+                )
+            raise ObjectError(f"{self.folder}: {short(name)} {what}") from None
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or type(error).__name__
             raise ObjectError(f"{self.folder}: {short(name)} cannot be read ({reason})") from None
+        for pattern, system, command in _POINTERS:
+            if pattern.match(data):
+                raise ObjectError(
+                    f"{self.folder}: {short(name)} is a pointer of {system} instead of the file, so the download is "
+                    f"not complete; get the contents of all files (`{command}`)"
+                )
+        return data
 
     def _read(self, resolved: Path, name: str, most_bytes: int) -> bytes:
         # A link that was put there since is not followed, and a pipe does not block.
@@ -92,7 +114,33 @@ class ObjectFiles:
         return self.folder / relative
 
 
-def _keeps(above: Path, cache: str, top: Path) -> bool:
-    """Whether a folder of contents that is called `cache` is that of the tree at `top`, somewhere below `above`."""
+def _caches(above: Path, top: Path) -> Iterator[Path]:
+    """Where git-annex, DVC and a model hub's client keep what they show as links in the tree at `top`, below `above`.
+
+    Each of these folders may be a link, as to a larger disk; none of them is around the tree.
+    """
+    caches = [_git_folder(above) / "annex/objects", above / ".dvc/cache"]
     # A hub's client has its links below `snapshots`, beside `blobs`; the others have theirs anywhere in a repository.
-    return (cache != "blobs" or top.is_relative_to(above / "snapshots")) and (above / cache).is_dir()
+    if top.is_relative_to(above / "snapshots"):
+        caches.append(above / "blobs")
+    for cache in caches:
+        try:
+            resolved = cache.resolve(strict=True)
+        except (OSError, RuntimeError, ValueError):
+            continue
+        if not top.is_relative_to(resolved):
+            yield resolved
+
+
+def _git_folder(repository: Path) -> Path:
+    """Where Git keeps its own files of a repository: of a submodule or a worktree, `.git` is a file that names it."""
+    folder = repository / ".git"
+    try:
+        if folder.is_file():
+            with folder.open("rb") as file:
+                named = file.read(_MOST_GITFILE)
+            if named.startswith(_GITFILE):
+                return repository / os.fsdecode(named.removeprefix(_GITFILE).rstrip(b"\r\n"))
+    except OSError:
+        pass
+    return folder

@@ -30,6 +30,9 @@ _BLANKS = b"\t\r\v\f"
 _STL_HEADER, _STL_TRIANGLE = 84, 50
 _STL_VERTEX = b"vertex "
 _BLOCK_BYTES = 2 << 20
+_BLOCK_TRIANGLES = 1 << 16
+_MIN_SINE = 1e-9
+"""Of the angle at a triangle's first corner; a triangle with a smaller one is a line or a point."""
 
 
 class MeshSizeError(ObjectError):
@@ -45,11 +48,25 @@ def parse_mesh(data: bytes, name: str) -> Mesh:
 
     Raises:
         MeshSizeError: the file is beyond a bound.
-        ObjectError: it is truncated, malformed, not finite, or holds no face.
+        ObjectError: it is truncated, malformed, not finite, or holds no face that has an area.
     """
     if len(data) > MAX_OBJ_BYTES:
         raise MeshSizeError(f"{name}: {len(data)} bytes; at most {MAX_OBJ_BYTES} are allowed")
-    return parse_stl(data, name) if name.lower().endswith(".stl") else parse_obj(data, name)
+    mesh = parse_stl(data, name) if name.lower().endswith(".stl") else parse_obj(data, name)
+    if not _has_area(mesh):
+        raise ObjectError(f"{name}: no triangle has an area: each is a line or a point")
+    return mesh
+
+
+def _has_area(mesh: Mesh) -> bool:
+    """Whether a triangle is more than a line or a point."""
+    for start in range(0, len(mesh.faces), _BLOCK_TRIANGLES):
+        first, second, third = mesh.vertices[mesh.faces[start : start + _BLOCK_TRIANGLES]].swapaxes(0, 1)
+        a, b = second - first, third - first
+        lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+        if (np.linalg.norm(np.cross(a, b), axis=1) > _MIN_SINE * lengths).any():
+            return True
+    return False
 
 
 def parse_obj(data: bytes, name: str) -> Mesh:

@@ -7,7 +7,6 @@ left out, as the simulator's own reader does, and noted; a part that keeps no sh
 """
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -16,6 +15,7 @@ from urllib.parse import unquote
 
 import numpy as np
 from pydantic import ValidationError
+from pydantic_core import from_json
 
 from collector import meshes
 from collector.articulation import MIN_RANGE, ArticulatedObject, Body, Joint, Mesh
@@ -90,10 +90,11 @@ def read_object(folder: Path, tree: Path | None = None) -> ArticulatedObject:
 def _require_a_movable_part(bodies: Sequence[Body], folder: Path) -> None:
     moving = [body for body in bodies if body.joint is not None and body.joint.span > MIN_RANGE]
     if not moving:
-        joint = next(body.joint for body in bodies if body.joint is not None)
+        joints = [body.joint for body in bodies if body.joint is not None]
+        first = joints[0]
         raise ObjectError(
-            f"{folder}: has no movable part: no joint can move, since the lower and the upper limit of each are the "
-            f"same (such as {joint.lower:g} and {joint.upper:g} of {short(joint.name)})"
+            f"{folder}: has no movable part: no joint can move, since the lower and the upper limit of each are "
+            f"{_alike(joints)} (such as {first.lower:g} and {first.upper:g} of {short(first.name)})"
         )
     if not any(body.visuals for body in moving):
         raise ObjectError(f"{folder}: has no movable part that can be seen: its moving links have no mesh")
@@ -104,10 +105,15 @@ def _joint_notes(urdf: Urdf, bodies: Sequence[Body]) -> Iterator[str]:
     still = [body.joint for body in bodies if body.joint is not None and body.joint.span <= MIN_RANGE]
     if still:
         names = _listed([short(joint.name) for joint in still])
-        yield f"{len(still)} of {len(bodies) - 1} joints cannot move, since both limits are the same ({names})"
+        yield f"{len(still)} of {len(bodies) - 1} joints cannot move, since both limits are {_alike(still)} ({names})"
     mimics = [f"{short(joint.name)} of {short(joint.mimics)}" for joint in urdf.joints if joint.mimics]
     if mimics:
         yield f"<mimic> is not followed: what has it moves on its own ({_listed(mimics)})"
+
+
+def _alike(joints: Sequence[Joint]) -> str:
+    """How the limits of joints that cannot move compare."""
+    return "nearly the same" if any(joint.span for joint in joints) else "the same"
 
 
 def _listed(words: Sequence[str]) -> str:
@@ -135,13 +141,27 @@ def _category(files: ObjectFiles) -> str:
         )
     data = files.read(META_FILE, MAX_TEXT_BYTES)
     try:
-        meta = json.loads(data.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ObjectError(f"{files.folder / META_FILE}: malformed JSON ({type(error).__name__})") from None
+        meta = from_json(_text(data))
+    except ValueError as error:
+        # The parser's words name the cause and the place.
+        raise ObjectError(f"{files.folder / META_FILE}: malformed JSON ({error})") from None
     category = meta.get("model_cat") if isinstance(meta, dict) else None
     if not isinstance(category, str) or not 0 < len(category) <= MAX_WORD or not category.isprintable():
         raise ObjectError(f"{files.folder / META_FILE}: needs a 'model_cat', the category's name (docs/objects.md)")
     return category
+
+
+def _text(data: bytes) -> str:
+    """UTF-8 text, with or without a byte order mark; a ValueError says where it is none."""
+    try:
+        text, wrong = data.decode("utf-8-sig"), data.find(b"\0")
+    except UnicodeDecodeError as error:
+        text, wrong = "", error.start
+    if wrong >= 0:
+        # UTF-16 without a byte order mark is valid UTF-8 with zero bytes in it.
+        line, column = data.count(b"\n", 0, wrong) + 1, wrong - data.rfind(b"\n", 0, wrong)
+        raise ValueError(f"not UTF-8 text at line {line} column {column}; save it in UTF-8")
+    return text
 
 
 def _part_names(semantics: bytes, folder: Path) -> dict[str, str]:
@@ -179,8 +199,8 @@ class _Meshes:
             ObjectError: it is none below the folder, unreadable, or beyond a bound.
         """
         file = self._below_folder(name)
-        if not self._files.is_file(file):
-            self.unusable[name] = "is no file, or a link to none" if self._files.exists(file) else "is absent"
+        if not self._files.exists(file):
+            self.unusable[name] = "is absent"
             return None
         data = self._files.read(file, min(MAX_OBJECT_BYTES - self._bytes, meshes.MAX_OBJ_BYTES))
         self._bytes += len(data)

@@ -3,6 +3,7 @@
 Inertias, materials and dynamics are skipped: hidden dynamics are drawn for each rollout instead.
 """
 
+import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -21,9 +22,14 @@ MAX_URDF_BYTES = 2 << 20
 MAX_LINKS = 500
 MAX_SHAPES = 5_000
 MAX_NUMBER = 1e6
+MIN_SIZE = 1e-9
+"""Of a shape's lengths and scales; what is smaller has no extent."""
 MAX_NAME = 200
 MAX_PATH = 1000
 MESH_ENDINGS = (".obj", ".stl")
+_XACRO_TAG = re.compile(r"\{\S*xacro/?\}")
+"""Each of the namespaces that xacro has had ends in its name."""
+_XACRO_ADVICE = "it holds <xacro:...> elements, so it is not a URDF yet; run xacro first"
 
 JointKind = Literal["fixed", "revolute", "continuous", "prismatic"]
 ShapeKind = Literal["mesh", "box", "cylinder", "sphere"]
@@ -110,6 +116,8 @@ class _Reader:
     def robot(self, robot: Element) -> tuple[dict[str, Link], list[UrdfJoint]]:
         if robot.tag != "robot":
             raise ObjectError(f"the root element is <{robot.tag[:40]}> instead of <robot>")
+        if any(_XACRO_TAG.match(element.tag) for element in robot.iter()):
+            raise ObjectError(_XACRO_ADVICE)
         links, joints = robot.findall("link"), robot.findall("joint")
         if len(links) > MAX_LINKS or len(joints) > MAX_LINKS:
             raise ObjectError(f"{len(links)} links and {len(joints)} joints; at most {MAX_LINKS} of each are allowed")
@@ -144,6 +152,8 @@ def _parse_xml(data: bytes) -> Element:
     except defusedxml.DefusedXmlException as error:
         raise ObjectError(f"document types and entities are refused ({type(error).__name__})") from None
     except (ParseError, ValueError, LookupError) as error:
+        if "unbound prefix" in str(error) and b"<xacro:" in data:
+            raise ObjectError(_XACRO_ADVICE) from None
         raise ObjectError(f"malformed XML ({' '.join(str(error).split())[:80]})") from None
 
 
@@ -191,14 +201,17 @@ def _shape(element: Element) -> Shape:
     kind, inner = found[0]
     pose = _pose(element)
     if kind == "mesh":
-        return Shape(kind, pose, _numbers(inner, "scale", "1 1 1", 3), _mesh_file(inner))
+        scale = _numbers(inner, "scale", "1 1 1", 3)
+        if np.abs(scale).min() < MIN_SIZE:
+            raise ObjectError(f"a <mesh> needs a scale other than 0 along each axis; given {scale.tolist()}")
+        return Shape(kind, pose, scale, _mesh_file(inner))
     if kind == "box":
         size = _numbers(inner, "size", "", 3)
     elif kind == "cylinder":
         size = np.concatenate([_numbers(inner, "radius", "", 1), _numbers(inner, "length", "", 1)])
     else:
         size = _numbers(inner, "radius", "", 1)
-    if size.min() <= 0:
+    if size.min() < MIN_SIZE:
         raise ObjectError(f"a <{kind}> needs a positive size; given {size.tolist()}")
     return Shape(kind, pose, size)
 

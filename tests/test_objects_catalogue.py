@@ -92,6 +92,13 @@ def test_a_list_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
     assert read_list(tmp_path / "list.txt") == ("box-0000", "box-0001")
 
 
+@pytest.mark.parametrize("text", ["", " \n\n"])
+def test_a_list_that_names_no_object_is_refused(shelf: Path, tmp_path: Path, text: str) -> None:
+    (tmp_path / "list.txt").write_text(text)
+    with pytest.raises(UsageError, match="names no object"):
+        scan(shelf, tmp_path / "list.txt")
+
+
 def test_a_list_that_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "list.txt").write_bytes(b"\xff\xfe")
     with pytest.raises(UsageError, match="not text"):
@@ -128,6 +135,56 @@ def test_links_into_the_cache_of_a_download_are_followed(shelf: Path, tmp_path: 
         (entry,) = scan(path).usable
         assert entry.ref == scan(shelf / "box-0000").usable[0].ref
         assert load(entry).ref == load_ref(path, entry.ref).ref == entry.ref
+
+
+@pytest.mark.parametrize(
+    ("link", "cache", "links"),
+    [
+        ("repository/.dvc/cache", "disk/cache/files/md5", "repository/objects"),
+        ("objects/.dvc/cache", "disk/cache/files/md5", "objects"),
+        ("repository/.git/annex/objects", "disk/objects/a", "repository/objects"),
+        ("hub/blobs", "disk/blobs", "hub/snapshots/abc"),
+        ("all/sub/.git", "all/.git/modules/sub/annex/objects/a", "all/sub/objects"),
+        ("all/sub/.git", "all/.git/modules/sub/annex/objects/a", "all/sub"),
+    ],
+)
+@pytest.mark.parametrize("gitfile", [False, True])
+def test_a_cache_may_be_elsewhere(
+    shelf: Path, tmp_path: Path, link: str, cache: str, links: str, gitfile: bool
+) -> None:
+    objects = linked(shelf, tmp_path / cache, tmp_path / links)
+    ((_, reason),) = scan(objects).refused
+    assert "leads out" in reason
+    linking = tmp_path / link
+    linking.parent.mkdir(parents=True, exist_ok=True)
+    kept = tmp_path / cache.removesuffix("/files/md5").removesuffix("/a").removesuffix("/annex/objects")
+    target = os.path.relpath(kept, linking.parent)
+    if gitfile and linking.name == ".git":
+        linking.write_text(f"gitdir: {target}\n")
+    else:
+        linking.symlink_to(target)
+    (entry,) = scan(objects).usable
+    assert entry.ref == scan(shelf / "box-0000").usable[0].ref
+    (tmp_path / "disk-secret").write_text("the key is 1234\n")
+    meta = objects / "box-0000/meta.json"
+    meta.unlink()
+    meta.symlink_to(tmp_path / "disk-secret")
+    ((_, reason),) = scan(objects).refused
+    assert "leads out" in reason
+
+
+@pytest.mark.parametrize("target", ["", "secrets"])
+def test_what_an_object_calls_a_cache_is_none(shelf: Path, tmp_path: Path, target: str) -> None:
+    folder = Path(shutil.copytree(shelf / "box-0000", tmp_path / "objects/box-0000"))
+    (tmp_path / "secrets").mkdir()
+    shutil.copy(folder / "meta.json", tmp_path / "secrets/meta.json")
+    (folder / "meta.json").unlink()
+    (folder / "meta.json").symlink_to(tmp_path / "secrets/meta.json")
+    (folder / ".dvc").mkdir()
+    (folder / ".dvc/cache").symlink_to(tmp_path / target)
+    for path in (folder, folder.parent):
+        ((_, reason),) = scan(path).refused
+        assert "leads out" in reason
 
 
 def test_a_link_to_an_object_is_followed(shelf: Path, tmp_path: Path) -> None:

@@ -160,7 +160,7 @@ def _many_shapes(folder: Path) -> None:
 
 def _many_copies(folder: Path) -> None:
     # One large mesh that a small URDF shows again and again.
-    rows = "".join(f"v {i} 0 0\n" for i in range(20_000))
+    rows = "".join(f"v {i} {i % 2} 0\n" for i in range(20_000))
     (folder / "textured_objs/cube.obj").write_text(rows + "f 1 2 3\n")
     shapes = "".join(
         f'<visual><origin xyz="{i} 0 0"/><geometry><mesh filename="textured_objs/cube.obj"/></geometry></visual>'
@@ -173,6 +173,11 @@ def _escape_by_link(folder: Path) -> None:
     (folder.parent / "secret.obj").write_text(CUBE_OBJ)
     (folder / "textured_objs/cube.obj").unlink()
     (folder / "textured_objs/cube.obj").symlink_to(folder.parent / "secret.obj")
+
+
+def _link_to_nothing(folder: Path) -> None:
+    (folder / CUBE).unlink()
+    (folder / CUBE).symlink_to("../.git/annex/objects/W2/9k/KEY/KEY")
 
 
 def _pipe(folder: Path) -> None:
@@ -202,6 +207,9 @@ BOMB = (
     + b"]><robot name='&b8;'/>"
 )
 CUBE = "textured_objs/cube.obj"
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 12345\n"
+ANNEX_POINTER = b"/annex/objects/MD5E-s12345--" + b"0" * 32 + b".obj\n"
+ANNEX_LINK = b"../../.git/annex/objects/W2/9k/KEY/KEY"
 HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "no URDF": (_removed("mobility.urdf"), "is missing"),
     "no meta": (_removed("meta.json"), "is missing"),
@@ -221,6 +229,11 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "OBJ infinite": (_spoiled(b"v 0 0 -inf\nf 1 1 1\n"), "not finite"),
     "OBJ binary": (_spoiled(bytes(range(256))), "not a Wavefront OBJ statement"),
     "OBJ unknown statement": (_spoiled(b"v 0 0 0\nf 1 1 1\ncall other.obj\n"), "not a Wavefront OBJ statement"),
+    "OBJ of points": (_spoiled(b"v 0 0 0\nv 1 0 0\nf 1 1 1\nf 2 2 2\n"), "no triangle has an area"),
+    "OBJ of a line": (_spoiled(b"v .1 .1 .1\nv .2 .2 .2\nv .3 .3 .3\nf 1 2 3\n"), "no triangle has an area"),
+    "scale of zero": (_replaced('scale="2 2 2"', 'scale="0 0 0"'), "a <mesh> needs a scale other than 0"),
+    "scale of almost zero": (_replaced('scale="2 2 2"', 'scale="1 1e-12 1"'), "a <mesh> needs a scale other than 0"),
+    "box of almost no size": (_replaced('size="2 2 2"', 'size="2 2 1e-300"'), "positive size"),
     "malformed XML": (_replaced("</robot>", "</robo"), "malformed XML"),
     "XML in an unknown encoding": (_written("mobility.urdf", b'<?xml version="1.0" encoding="nil"?><a/>'), "malformed"),
     "not XML": (_written("mobility.urdf", b"\0\1\2"), "malformed XML"),
@@ -290,9 +303,28 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "many links": (_many_links, "at most 500"),
     "many shapes": (_many_shapes, "more than 5000 shapes"),
     "many copies of a large mesh": (_many_copies, "vertices in all"),
-    "deep JSON": (_deep_json, "malformed JSON"),
     "malformed JSON": (_written("meta.json", b"{"), "malformed JSON"),
     "JSON with a giant number": (_written("meta.json", b"9" * 10_000), "malformed JSON"),
+    "JSON nested deeply": (_deep_json, "recursion limit exceeded at line 1 column"),
+    "JSON with a trailing comma": (
+        _written("meta.json", b'{"model_cat":\n "Box",}'),
+        "trailing comma at line 2 column 8",
+    ),
+    "JSON in UTF-16": (
+        _written("meta.json", '{"model_cat": "Box"}'.encode("utf-16")),
+        "not UTF-8 text at line 1 column 1;",
+    ),
+    "JSON in UTF-16 without a mark": (
+        _written("meta.json", '{"model_cat": "Box"}'.encode("utf-16-le")),
+        "not UTF-8 text at line 1 column 2;",
+    ),
+    "JSON in Latin-1": (_written("meta.json", b'{\n"model_cat": "B\xfcro"}'), "not UTF-8 text at line 2 column 16;"),
+    "mesh that is a pointer of Git LFS": (_written(CUBE, LFS_POINTER), "(`git lfs pull`)"),
+    "URDF that is a pointer of Git LFS": (_written("mobility.urdf", LFS_POINTER), "(`git lfs pull`)"),
+    "meta that is a pointer of git-annex": (_written("meta.json", ANNEX_POINTER), "(`git annex get`)"),
+    "mesh that is a pointer of git-annex": (_written(CUBE, ANNEX_POINTER), "(`git annex get`)"),
+    "mesh that is a link of git-annex as text": (_written(CUBE, ANNEX_LINK), "(`git annex get`)"),
+    "mesh that is a link to contents that are absent": (_link_to_nothing, "(`git annex get`, `dvc pull`)"),
     "JSON that is no object": (_written("meta.json", b"[]"), "needs a 'model_cat'"),
     "no category": (_written("meta.json", b'{"model_cat": 3}'), "needs a 'model_cat'"),
     "semantics of two words": (_written("semantics.txt", b"link_0 hinge\n"), "line 1"),
@@ -313,7 +345,7 @@ def test_what_cannot_be_used_is_refused_with_one_line(folder: Path, name: str) -
     assert len(message) < 500
 
 
-@pytest.mark.parametrize("data", [None, b"", b"v 0 0 nan\nf 1 1 1\n", b"v 0 0 0\n"])
+@pytest.mark.parametrize("data", [None, b"", b"v 0 0 nan\nf 1 1 1\n", b"v 0 0 0\n", b"v 1 2 3\nf 1 1 1\n"])
 def test_a_mesh_that_is_absent_or_unusable_is_left_out_and_noted(folder: Path, data: bytes | None) -> None:
     cube = (folder / CUBE).read_bytes()
     (folder / "textured_objs/door.obj").write_bytes(cube)
@@ -357,6 +389,32 @@ def test_joints_that_mimic_or_cannot_move_are_noted(folder: Path) -> None:
     still, mimic = read_object(folder).notes
     assert still == "1 of 2 joints cannot move, since both limits are the same ('turn')"
     assert mimic == "<mimic> is not followed: what has it moves on its own ('hinge' of 'lost')"
+
+
+def test_limits_that_are_nearly_the_same_are_called_so(folder: Path) -> None:
+    edit(folder, 'type="continuous">', 'type="revolute"><limit lower="0" upper="1e-9"/>')
+    assert read_object(folder).notes == ("1 of 2 joints cannot move, since both limits are nearly the same ('turn')",)
+
+
+def test_a_joint_of_two_infinite_limits_is_continuous(folder: Path) -> None:
+    continuous = read_object(folder).parts[1].joint
+    edit(folder, 'type="continuous">', 'type="revolute"><limit lower="-inf" upper="inf"/>')
+    joint = read_object(folder).parts[1].joint
+    assert continuous is not None
+    assert joint is not None
+    assert (joint.lower, joint.upper) == (continuous.lower, continuous.upper)
+
+
+@pytest.mark.parametrize(
+    "declared", ['xmlns:xacro="http://www.ros.org/wiki/xacro"', 'xmlns:xacro="http://ros.org/xacro"', ""]
+)
+@pytest.mark.parametrize("inner", ["<xacro:door/>", '<link name="x"><xacro:if value="1"/></link>'])
+def test_xacro_is_refused_unless_it_is_only_declared(folder: Path, declared: str, inner: str) -> None:
+    edit(folder, "<robot ", f"<robot {declared} ")
+    assert read_object(folder).notes == ()
+    edit(folder, "</robot>", f"{inner}</robot>")
+    with pytest.raises(ObjectError, match="run xacro first"):
+        read_object(folder)
 
 
 def test_byte_order_marks_and_line_ends_of_other_systems_change_nothing(folder: Path) -> None:
