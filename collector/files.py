@@ -117,7 +117,9 @@ class ObjectFiles:
 def _caches(above: Path, top: Path) -> Iterator[Path]:
     """Where git-annex, DVC and a model hub's client keep what they show as links in the tree at `top`, below `above`.
 
-    Each of these folders may be a link, as to a larger disk; none of them is around the tree.
+    None of them is around the tree. One that is a link itself, as to a larger disk, counts only as far as it leads into
+    the `.git` of a repository around the tree, as that of a submodule does: the link came with the objects, and could
+    make any folder of this machine a cache.
     """
     caches = [_git_folder(above) / "annex/objects", above / ".dvc/cache"]
     # A hub's client has its links below `snapshots`, beside `blobs`; the others have theirs anywhere in a repository.
@@ -128,7 +130,8 @@ def _caches(above: Path, top: Path) -> Iterator[Path]:
             resolved = cache.resolve(strict=True)
         except (OSError, RuntimeError, ValueError):
             continue
-        if not top.is_relative_to(resolved):
+        inside = resolved.is_relative_to(above) or any(resolved.is_relative_to(p / ".git") for p in above.parents)
+        if inside and not top.is_relative_to(resolved):
             yield resolved
 
 

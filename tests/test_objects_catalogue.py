@@ -140,16 +140,12 @@ def test_links_into_the_cache_of_a_download_are_followed(shelf: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("link", "cache", "links"),
     [
-        ("repository/.dvc/cache", "disk/cache/files/md5", "repository/objects"),
-        ("objects/.dvc/cache", "disk/cache/files/md5", "objects"),
-        ("repository/.git/annex/objects", "disk/objects/a", "repository/objects"),
-        ("hub/blobs", "disk/blobs", "hub/snapshots/abc"),
         ("all/sub/.git", "all/.git/modules/sub/annex/objects/a", "all/sub/objects"),
         ("all/sub/.git", "all/.git/modules/sub/annex/objects/a", "all/sub"),
     ],
 )
 @pytest.mark.parametrize("gitfile", [False, True])
-def test_a_cache_may_be_elsewhere(
+def test_the_cache_of_a_submodule_is_followed(
     shelf: Path, tmp_path: Path, link: str, cache: str, links: str, gitfile: bool
 ) -> None:
     objects = linked(shelf, tmp_path / cache, tmp_path / links)
@@ -169,6 +165,25 @@ def test_a_cache_may_be_elsewhere(
     meta = objects / "box-0000/meta.json"
     meta.unlink()
     meta.symlink_to(tmp_path / "disk-secret")
+    ((_, reason),) = scan(objects).refused
+    assert "leads out" in reason
+
+
+@pytest.mark.parametrize(
+    ("link", "links"),
+    [
+        ("repository/.dvc/cache", "repository/objects"),
+        ("objects/.dvc/cache", "objects"),
+        ("repository/.git/annex/objects", "repository/objects"),
+        ("hub/blobs", "hub/snapshots/abc"),
+    ],
+)
+def test_a_cache_that_is_a_link_to_elsewhere_is_not_followed(
+    shelf: Path, tmp_path: Path, link: str, links: str
+) -> None:
+    objects = linked(shelf, tmp_path / "disk", tmp_path / links)
+    (tmp_path / link).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / link).symlink_to(tmp_path / "disk")
     ((_, reason),) = scan(objects).refused
     assert "leads out" in reason
 
