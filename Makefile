@@ -23,9 +23,9 @@ run: $(STAMP)  ## Collect, train, collect again, evaluate: a small campaign, a f
 test: $(STAMP)  ## The tests, without the slow ones and chaos, in two processes.
 	$(BIN)/python -m pytest -q -m "not slow and not chaos and not exhaustive" -n 2 --dist worksteal
 
-test-slow: $(STAMP)  ## The slow tests, without those of containers.
+test-slow: $(STAMP)  ## The slow tests, without those of containers, in two processes.
 	@# Pytest ends with 5 where it selects no test, which is no failure of a suite that may be empty.
-	$(BIN)/python -m pytest -q -m "slow and not container" || test $$? -eq 5
+	$(BIN)/python -m pytest -q -m "slow and not container" -n 2 --dist worksteal || test $$? -eq 5
 
 test-container: $(STAMP)  ## Build the image and run the services of docker-compose.yml by podman, ten minutes; needs root.
 	$(BIN)/python -m pytest -q -s -m container
