@@ -314,3 +314,12 @@ def test_folders_of_killed_sessions_go_and_those_of_live_ones_stay(sessions: Pat
             assert sorted(sessions.iterdir()) == sorted([kept, own])
         living.communicate("\n")
     assert list(sessions.iterdir()) == []
+
+
+def test_a_session_that_does_not_come_up_is_said_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def late(**settings: object) -> None:
+        raise Exception("The current node timed out during startup.\nraylet failed")
+
+    monkeypatch.setattr("ray.init", late)
+    with pytest.raises(WorkerError, match=r"timed out during startup\.\); run the same command again"), ray_session(1):
+        pass
