@@ -40,9 +40,10 @@ _MOST_HOLDER = 400
 """Bytes that are read of what a lock file says."""
 _CREATE_LOCK, _CREATE_WAIT_S = f"{TEMPORARY_PREFIX}create.lock", 60.0
 
-logger = logging.getLogger(__name__)
 DAY_S = 24 * 3600.0
 """What a process of another machine or boot left counts as abandoned after so long; nothing is written for a day."""
+
+logger = logging.getLogger(__name__)
 
 
 def write_durably(path: Path, data: bytes) -> None:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from numcodecs.blosc import Blosc
 
 from shared.store.sealed import seal
+from tests.mutations import damaged, pick
 
 T = TypeVar("T")
 Rng = np.random.Generator
@@ -50,11 +51,6 @@ SEALS = ("manifest.json", "index.json", "policy.json")
 """Files that say what others must be."""
 
 
-def pick(rng: Rng, choices: Sequence[T]) -> T:
-    """One of some choices."""
-    return choices[int(rng.integers(len(choices)))]
-
-
 def noise(data: bytes, rng: Rng) -> bytes:
     """Up to four flips, cuts, repetitions, foreign bytes, and other lengths in place of a few bytes."""
     for _ in range(int(rng.integers(1, 5))):
@@ -65,24 +61,14 @@ def noise(data: bytes, rng: Rng) -> bytes:
             a, b = len(data) - b, len(data) - a
         b = min(b, a + 200)
         match int(rng.integers(8)):
-            case 0:
-                data = data[:a]
-            case 1:
-                data = data[:a] + data[b:]
-            case 2:
-                data = data[:b] + data[a:]
-            case 3:
-                data = data[:a] + rng.bytes(b - a) + data[b:]
-            case 4:
-                data = data[:a] + b"\0" * (b - a) + data[b:]
             case 5 | 6:
                 width = pick(rng, (1, 4, 4, 8))
                 number = pick(rng, (*LENGTHS, len(data), len(data) + 1, max(len(data) - 1, 0)))
                 data = (
                     data[:a] + (number % 256**width).to_bytes(width, pick(rng, ("little", "big"))) + data[a + width :]
                 )
-            case _ if a < len(data):
-                data = data[:a] + bytes([data[a] ^ 1 << int(rng.integers(8))]) + data[a + 1 :]
+            case kind:
+                data = damaged(data, a, b, kind, rng)
     return data
 
 

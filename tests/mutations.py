@@ -66,13 +66,32 @@ CATEGORIES = (
 def mutate(folder: Path, rng: Rng) -> str:
     """Damage one object's folder; returns the name of what was done."""
     mutations = (_URDF, _MESH, _JSON, _FILE)[int(rng.choice(4, p=[0.45, 0.35, 0.1, 0.1]))]
-    mutation = _pick(rng, mutations)
+    mutation = pick(rng, mutations)
     mutation(folder, rng)
     return mutation.__name__.strip("_")
 
 
-def _pick(rng: Rng, choices: Sequence[T]) -> T:
+def pick(rng: Rng, choices: Sequence[T]) -> T:
+    """One of some choices."""
     return choices[int(rng.integers(len(choices)))]
+
+
+def damaged(data: bytes, a: int, b: int, kind: int, rng: Rng) -> bytes:
+    """Data cut off (kind 0), with bytes a to b missing, repeated, random or zero (1 to 4), or with a bit flipped."""
+    match kind:
+        case 0:
+            return data[:a]
+        case 1:
+            return data[:a] + data[b:]
+        case 2:
+            return data[:b] + data[a:]
+        case 3:
+            return data[:a] + rng.bytes(b - a) + data[b:]
+        case 4:
+            return data[:a] + b"\0" * (b - a) + data[b:]
+        case _ if a < len(data):
+            return data[:a] + bytes([data[a] ^ 1 << int(rng.integers(8))]) + data[a + 1 :]
+    return data
 
 
 def _urdf(folder: Path) -> Path:
@@ -84,7 +103,7 @@ def _json(folder: Path) -> Path:
 
 
 def _mesh(folder: Path, rng: Rng) -> Path:
-    return _pick(rng, sorted(folder.rglob("*.obj")))
+    return pick(rng, sorted(folder.rglob("*.obj")))
 
 
 # Any file, as bytes.
@@ -97,31 +116,21 @@ def _noise(path: Path, rng: Rng) -> None:
         a, b = sorted(int(rng.integers(len(data) + 1)) for _ in range(2))
         b = min(b, a + 200)
         match int(rng.integers(7)):
-            case 0:
-                data = data[:a]
-            case 1:
-                data = data[:a] + data[b:]
-            case 2:
-                data = data[:b] + data[a:]
-            case 3:
-                data = data[:a] + rng.bytes(b - a) + data[b:]
-            case 4:
-                data = data[:a] + b"\0" * (b - a) + data[b:]
             case 5:
-                data = data[:a] + _pick(rng, NUMBERS).encode() + data[a:]
-            case _ if a < len(data):
-                data = data[:a] + bytes([data[a] ^ 1 << int(rng.integers(8))]) + data[a + 1 :]
+                data = data[:a] + pick(rng, NUMBERS).encode() + data[a:]
+            case kind:
+                data = damaged(data, a, b, kind, rng)
     path.write_bytes(data)
 
 
 def _numbers(path: Path, rng: Rng) -> None:
     """Other numbers in place of one, of a few, or of many."""
-    odds, data = _pick(rng, (0.0, 0.01, 0.2)), path.read_bytes()
+    odds, data = pick(rng, (0.0, 0.01, 0.2)), path.read_bytes()
     count = len(NUMBER.findall(data))
     chosen = rng.random(count) < odds
     if count:
         chosen[int(rng.integers(count))] = True
-    number, which = _pick(rng, NUMBERS).encode(), iter(chosen)
+    number, which = pick(rng, NUMBERS).encode(), iter(chosen)
     path.write_bytes(NUMBER.sub(lambda match: number if next(which) else match[0], data))
 
 
@@ -145,48 +154,48 @@ def _parent(robot: Element, child: Element) -> Element:
 
 
 def _remove(robot: Element, below: list[Element], rng: Rng) -> None:
-    chosen = _pick(rng, below)
+    chosen = pick(rng, below)
     _parent(robot, chosen).remove(chosen)
 
 
 def _duplicate(robot: Element, below: list[Element], rng: Rng) -> None:
-    chosen = _pick(rng, below)
+    chosen = pick(rng, below)
     parent = _parent(robot, chosen)
-    for _ in range(_pick(rng, (1, 2, 40))):
+    for _ in range(pick(rng, (1, 2, 40))):
         parent.append(chosen)
 
 
 def _move(robot: Element, below: list[Element], rng: Rng) -> None:
-    chosen = _pick(rng, below)
+    chosen = pick(rng, below)
     _parent(robot, chosen).remove(chosen)
-    _pick(rng, [robot, *robot.iter()]).append(chosen)
+    pick(rng, [robot, *robot.iter()]).append(chosen)
 
 
 def _swap_attributes(_: Element, below: list[Element], rng: Rng) -> None:
     having = [element for element in below if element.attrib]
-    a, b = _pick(rng, having), _pick(rng, having)
+    a, b = pick(rng, having), pick(rng, having)
     alike = [element for element in having if element.tag == a.tag]
-    b = _pick(rng, alike) if rng.random() < 0.7 else b
+    b = pick(rng, alike) if rng.random() < 0.7 else b
     a.attrib, b.attrib = dict(b.attrib), dict(a.attrib)
 
 
 def _drop_attribute(_: Element, below: list[Element], rng: Rng) -> None:
-    chosen = _pick(rng, [element for element in below if element.attrib])
-    del chosen.attrib[_pick(rng, sorted(chosen.attrib))]
+    chosen = pick(rng, [element for element in below if element.attrib])
+    del chosen.attrib[pick(rng, sorted(chosen.attrib))]
 
 
 def _strange_attribute(_: Element, below: list[Element], rng: Rng) -> None:
-    chosen = _pick(rng, [element for element in below if element.attrib])
-    value = _pick(rng, (*PATHS, *NUMBERS, "1 " * 3, "0 0 0", "1e6 1e6 1e6", "-1 1 1", "floating", "x\ny", " "))
-    chosen.attrib[_pick(rng, sorted(chosen.attrib))] = value
+    chosen = pick(rng, [element for element in below if element.attrib])
+    value = pick(rng, (*PATHS, *NUMBERS, "1 " * 3, "0 0 0", "1e6 1e6 1e6", "-1 1 1", "floating", "x\ny", " "))
+    chosen.attrib[pick(rng, sorted(chosen.attrib))] = value
 
 
 def _strange_path(_: Element, below: list[Element], rng: Rng) -> None:
-    _pick(rng, [element for element in below if element.tag == "mesh"]).attrib["filename"] = _pick(rng, PATHS)
+    pick(rng, [element for element in below if element.tag == "mesh"]).attrib["filename"] = pick(rng, PATHS)
 
 
 def _scale_meshes(_: Element, below: list[Element], rng: Rng) -> None:
-    scale = " ".join(_pick(rng, ("1", "-1", "0", "1e-9", "1e-4", "30", "1e6", "nan")) for _ in range(3))
+    scale = " ".join(pick(rng, ("1", "-1", "0", "1e-9", "1e-4", "30", "1e6", "nan")) for _ in range(3))
     for mesh in [element for element in below if element.tag == "mesh"]:
         mesh.attrib["scale"] = scale
 
@@ -194,14 +203,14 @@ def _scale_meshes(_: Element, below: list[Element], rng: Rng) -> None:
 def _limits(_: Element, below: list[Element], rng: Rng) -> None:
     pairs = ("-inf inf", "inf inf", "-inf -inf", "0 0", "-1e6 1e6", "1e5 1e5", "-30 30", "0 1e-30", "9 10", "1e308 0")
     for limit in [element for element in below if element.tag == "limit"]:
-        limit.attrib["lower"], limit.attrib["upper"] = _pick(rng, pairs).split()
+        limit.attrib["lower"], limit.attrib["upper"] = pick(rng, pairs).split()
 
 
 def _kinds_of_joints(_: Element, below: list[Element], rng: Rng) -> None:
     kinds = ("fixed", "revolute", "continuous", "prismatic", "floating", "planar", "Revolute")
-    one = _pick(rng, kinds)
+    one = pick(rng, kinds)
     for joint in [element for element in below if element.tag == "joint"]:
-        joint.attrib["type"] = one if rng.random() < 0.7 else _pick(rng, kinds)
+        joint.attrib["type"] = one if rng.random() < 0.7 else pick(rng, kinds)
 
 
 def _reconnect(_: Element, below: list[Element], rng: Rng) -> None:
@@ -209,37 +218,37 @@ def _reconnect(_: Element, below: list[Element], rng: Rng) -> None:
     links = [element.attrib["name"] for element in below if element.tag == "link"]
     ends = [element for element in below if element.tag in ("parent", "child")]
     for _ in range(int(rng.integers(1, 4))):
-        _pick(rng, ends).attrib["link"] = _pick(rng, links)
+        pick(rng, ends).attrib["link"] = pick(rng, links)
 
 
 def _many(robot: Element, below: list[Element], rng: Rng) -> None:
     """A chain or a star of many more links, or many more shapes."""
-    count = _pick(rng, (30, 120, 254, 300, 700))
-    last, kind = _pick(rng, [element for element in below if element.tag == "link"]), int(rng.integers(3))
+    count = pick(rng, (30, 120, 254, 300, 700))
+    last, kind = pick(rng, [element for element in below if element.tag == "link"]), int(rng.integers(3))
     shapes = [element for element in below if element.tag in ("visual", "collision")]
     for k in range(count):
         if kind == 2:
-            last.append(_pick(rng, shapes))
+            last.append(pick(rng, shapes))
             continue
         link = SubElement(robot, "link", name=f"more-{k}")
-        link.append(_pick(rng, shapes))
-        joint = SubElement(robot, "joint", name=f"more-{k}", type=_pick(rng, ("continuous", "prismatic")))
+        link.append(pick(rng, shapes))
+        joint = SubElement(robot, "joint", name=f"more-{k}", type=pick(rng, ("continuous", "prismatic")))
         SubElement(joint, "parent", link=last.attrib["name"])
         SubElement(joint, "child", link=f"more-{k}")
         SubElement(joint, "limit", lower="0", upper="0.1")
-        SubElement(joint, "axis", xyz=_pick(rng, ("1 0 0", "0 1 0", "1 1e-8 1", "0 0 -1e-8")))
+        SubElement(joint, "axis", xyz=pick(rng, ("1 0 0", "0 1 0", "1 1e-8 1", "0 0 -1e-8")))
         last = link if kind else last
 
 
 def _deep_urdf(folder: Path, rng: Rng) -> None:
-    depth = _pick(rng, (500, 20_000, 200_000))
+    depth = pick(rng, (500, 20_000, 200_000))
     data = _urdf(folder).read_bytes().replace(b"</robot>", b"")
     _urdf(folder).write_bytes(data + b"<a>" * depth + b"</a>" * depth + b"</robot>")
 
 
 def _whole_urdf(folder: Path, rng: Rng) -> None:
     whole = (BOMB, EXTERNAL, b"", b"<robot/>", b"\xff\xfe<\0r\0>\0", b"\x1f\x8b" + rng.bytes(500), b"<robot>" * 9)
-    _urdf(folder).write_bytes(_pick(rng, whole))
+    _urdf(folder).write_bytes(pick(rng, whole))
 
 
 # Meshes, as vertices and faces.
@@ -259,13 +268,13 @@ def _vertices_mapped(folder: Path, rng: Rng) -> None:
         case 2:
             vertices[:] = vertices[0]
         case 3:
-            vertices *= _pick(rng, (1e-12, 1e-7, 1e-5, 1e-3, 12.0, 1e3, 1e5, 1e300))
+            vertices *= pick(rng, (1e-12, 1e-7, 1e-5, 1e-3, 12.0, 1e3, 1e5, 1e300))
         case 4:
-            vertices += _pick(rng, (5.0, 49.0, 1e4, 9e5))
+            vertices += pick(rng, (5.0, 49.0, 1e4, 9e5))
         case 5:
-            vertices[int(rng.integers(len(vertices)))] *= _pick(rng, (30.0, 1e5, np.nan, np.inf))
+            vertices[int(rng.integers(len(vertices)))] *= pick(rng, (30.0, 1e5, np.nan, np.inf))
         case 6:
-            vertices = rng.normal(size=vertices.shape) * _pick(rng, (1e-6, 1.0, 8.0))
+            vertices = rng.normal(size=vertices.shape) * pick(rng, (1e-6, 1.0, 8.0))
         case 7:
             vertices[:, 0] = 1e-7 * rng.normal(size=len(vertices))
         case 8:
@@ -280,7 +289,7 @@ def _vertices_mapped(folder: Path, rng: Rng) -> None:
 def _whole_mesh(folder: Path, rng: Rng) -> None:
     """A mesh of one triangle, of one point, of duplicates, of a giant polygon, of very many vertices."""
     triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
-    many = int(_pick(rng, (300, 20_000, 60_000)))
+    many = int(pick(rng, (300, 20_000, 60_000)))
     ball = rng.normal(size=(many, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     sphere = "".join(f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in ball)
@@ -302,14 +311,14 @@ def _whole_mesh(folder: Path, rng: Rng) -> None:
         "v 0 0 0\nv 0 0 0\nv 1 1 1\nv 1e-12 0 0\nf 1 2 3\nf 2 3 4\n",
         "call x.obj\n" + triangle + "f 1 2 3\n",
     )
-    _mesh(folder, rng).write_text(_pick(rng, whole))
+    _mesh(folder, rng).write_text(pick(rng, whole))
 
 
 # Other files, and files that are none.
 
 
 def _strange_category(folder: Path, rng: Rng) -> None:
-    value = _pick(rng, CATEGORIES)
+    value = pick(rng, CATEGORIES)
     _json(folder).write_bytes(value if rng.random() < 0.5 else b'{"model_cat": ' + value + b"}")
 
 
@@ -322,12 +331,12 @@ def _strange_semantics(folder: Path, rng: Rng) -> None:
         b"link_0 hinge \xe2\x80\xae",
         b"x y z\n" * 9999,
     )
-    (folder / "semantics.txt").write_bytes(_pick(rng, rows))
+    (folder / "semantics.txt").write_bytes(pick(rng, rows))
 
 
 def _no_file(folder: Path, rng: Rng) -> None:
     """A file that is gone, a folder, a pipe, or a link to elsewhere, to itself, or to something endless."""
-    path = _pick(rng, (_urdf(folder), _json(folder), folder / "semantics.txt", _mesh(folder, rng)))
+    path = pick(rng, (_urdf(folder), _json(folder), folder / "semantics.txt", _mesh(folder, rng)))
     path.unlink()
     match int(rng.integers(7)):
         case 0:
@@ -341,11 +350,11 @@ def _no_file(folder: Path, rng: Rng) -> None:
         case 4:
             path.symlink_to("/dev/zero")
         case 5:
-            path.symlink_to(_pick(rng, sorted(folder.rglob("*.obj")) or [folder]))
+            path.symlink_to(pick(rng, sorted(folder.rglob("*.obj")) or [folder]))
 
 
 def _noise_in_other_files(folder: Path, rng: Rng) -> None:
-    _noise(_pick(rng, (_json(folder), folder / "semantics.txt")), rng)
+    _noise(pick(rng, (_json(folder), folder / "semantics.txt")), rng)
 
 
 def _on(find: Callable[[Path, Rng], Path], damage: Callable[[Path, Rng], None], name: str) -> Mutation:

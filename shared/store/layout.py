@@ -26,7 +26,7 @@ from shared.configuration import StrictModel
 from shared.documents import MAX_VALUES, parse_object, problem_of
 from shared.errors import SchemaVersionError, StoreError
 from shared.plan import Job, Setting
-from shared.store.sealed import is_sealed, unseal
+from shared.store.sealed import is_sealed, unsealed
 
 SCHEMA_VERSION = 1
 """What the number promises, and when it grows, is told in docs/compatibility.md."""
@@ -159,10 +159,11 @@ def parse_sealed(model: type[Document], data: bytes, source: str, what: str, val
         SchemaVersionError: it is of another schema version.
         StoreError: it is damaged or foreign.
     """
+    content = parse_object(data, source, values)
     if "schema_version" in model.model_fields:
-        check_schema_version(parse_object(data, source, values), source)
+        check_schema_version(content, source)
     try:
-        return model.model_validate(unseal(data, source, values), extra="allow")
+        return model.model_validate(unsealed(content, data, source), extra="allow")
     except ValidationError as error:
         raise StoreError(f"{source}: not {what} ({problem_of(error)}); the file is damaged or foreign") from None
 

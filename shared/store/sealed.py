@@ -26,7 +26,15 @@ def unseal(data: bytes, source: str, values: int = MAX_VALUES) -> dict[str, Any]
     Raises:
         StoreError: it is not JSON, not an object, or not what was sealed, byte for byte.
     """
-    content = parse_object(data, source, values)
+    return unsealed(parse_object(data, source, values), data, source)
+
+
+def unsealed(content: dict[str, Any], data: bytes, source: str) -> dict[str, Any]:
+    """The same of a document that is parsed already.
+
+    Raises:
+        StoreError: it is not what was sealed, byte for byte.
+    """
     checksum = content.pop(_SEAL, None)
     if checksum != _checksum(content) or seal(content) != data:
         raise StoreError(f"{source}: its checksum does not match; the file is damaged: restore it from a copy")
