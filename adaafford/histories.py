@@ -25,6 +25,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, field_va
 from adaafford.columns import shown, without_mark
 from adaafford.scans import ScanFrame, Vector, action_at
 from shared.configuration import StrictModel
+from shared.documents import named_twice
 from shared.errors import UsageError
 from shared.files import read_bounded, write_atomically
 from shared.vocabulary import Action, Interaction, Observation, Outcome, OutcomeKind
@@ -209,9 +210,8 @@ def parse_json(model: type[Model], data: bytes, source: str, remedy: str) -> Mod
 
 
 def _without_doubles(pairs: list[tuple[str, object]]) -> None:
-    names = [name for name, _ in pairs]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"the name {shown(twice[:1])!r} stands twice")
+    if (name := named_twice(pairs)) is not None:
+        raise ValueError(f"the name {shown([name])!r} stands twice")
 
 
 def write_history(path: Path, history: History) -> None:

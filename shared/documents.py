@@ -85,9 +85,16 @@ def printable(text: str, most: int = MAX_WORD) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in text[:most])
 
 
-def _refuse_twins(pairs: list[tuple[str, Any]]) -> None:
+def named_twice(pairs: list[tuple[str, Any]]) -> str | None:
+    """The first name of an object's pairs that stands there again; None if there is none."""
     seen: set[str] = set()
     for name, _ in pairs:
         if name in seen:
-            raise ValueError(f"'{printable(name)}' stands twice")
+            return name
         seen.add(name)
+    return None
+
+
+def _refuse_twins(pairs: list[tuple[str, Any]]) -> None:
+    if (name := named_twice(pairs)) is not None:
+        raise ValueError(f"'{printable(name)}' stands twice")
