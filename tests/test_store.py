@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from enum import Enum
 from itertools import pairwise
@@ -351,6 +354,20 @@ def test_a_shard_opens_in_plain_zarr_and_parquet(tmp_path: Path) -> None:
     assert np.array_equal(points, [one.points for rollout in rollouts for one in rollout.observations])
     motions = pq.read_table(shard / "interactions.parquet").column("motion").to_pylist()
     assert motions == [one.outcome.motion for rollout in rollouts for one in rollout.interactions]
+
+
+def test_reading_leaves_no_thread_that_could_outlive_python(tmp_path: Path) -> None:
+    # One of Arrow's that drops the last reference to our bytes while Python ends takes the process down (SIGABRT).
+    make(tmp_path / "store", (0, 2))
+    code = (
+        "import os, sys\n"
+        "from shared.store import Store, verify\n"
+        "store, before = Store.open(sys.argv[1]), len(os.listdir('/proc/self/task'))\n"
+        "assert not verify(store) and store.interactions() and store.rollouts()\n"
+        "assert len(os.listdir('/proc/self/task')) == before"
+    )
+    root = str(Path(__file__).parents[1])
+    subprocess.run([sys.executable, "-c", code, tmp_path / "store"], env={**os.environ, "PYTHONPATH": root}, check=True)
 
 
 def test_both_frames_say_the_same(tmp_path: Path) -> None:

@@ -157,7 +157,8 @@ def _read(data: bytes, columns: Columns, rows: int, source: str, names: Sequence
         if group.num_rows != rows:
             raise ValueError(f"a group of {group.num_rows} rows")
         unpacked_size(data, group, frozenset(wanted), size_limit(rows))
-    table = file.read(columns=wanted)
+    # In this thread: a worker of Arrow's that lets go of `data` while Python ends brings the process down (SIGABRT).
+    table = file.read(columns=wanted, use_threads=False)
     table.validate(full=True)
     if len(table) != rows:
         raise ValueError(f"{len(table)} rows in the columns")
