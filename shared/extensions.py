@@ -1,0 +1,92 @@
+"""What is found by name: what this project has of a kind, and what other people's packages add through entry points.
+
+A package adds a primitive called "twist" by these lines of its pyproject.toml, and is found once it is installed:
+
+    [project.entry-points."adaafford.primitives"]
+    twist = "my_package.twist:TWIST"
+"""
+
+from collections.abc import Iterator, Mapping
+from importlib.metadata import EntryPoint, entry_points
+from typing import Generic, TypeVar
+
+from shared.errors import UsageError
+
+Item = TypeVar("Item")
+
+
+class Registry(Generic[Item]):
+    """All things of one kind, by name.
+
+    Args:
+        kind: what messages call one of them, such as "primitive".
+        of: the class that an entry point must name an instance of.
+        built_in: this project's own, which no package can replace.
+    """
+
+    def __init__(self, kind: str, of: type[Item], built_in: Mapping[str, Item]) -> None:
+        self.kind, self.group = kind, f"adaafford.{kind.replace(' ', '_')}s"
+        self._of = of
+        self._built_in = dict(built_in)
+        self._loaded: dict[str, Item] = {}
+
+    def names(self) -> list[str]:
+        """Those of this project, in their order, then those of other packages; none of these is imported."""
+        return [*self._built_in, *sorted(self._foreign())]
+
+    def get(self, name: str) -> Item:
+        """The one that is called `name`; its package is imported where it is not ours.
+
+        Raises:
+            UsageError: there is none, several packages add one, or the package that adds it cannot be imported.
+        """
+        if name in self._built_in:
+            return self._built_in[name]
+        if name not in self._loaded:
+            entries = self._foreign()
+            if name not in entries:
+                raise UsageError(f"unknown {self.kind} '{name}'; allowed: {', '.join(self.names())}")
+            self._loaded[name] = self._load(entries[name])
+        return self._loaded[name]
+
+    def __iter__(self) -> Iterator[Item]:
+        """All of them; imports the packages that add any."""
+        return map(self.get, self.names())
+
+    def package_of(self, name: str) -> str | None:
+        """Name and version of the package that adds it, as "my-package 1.2"; None for one of ours.
+
+        Raises:
+            UsageError: there is none.
+        """
+        if name in self._built_in:
+            return None
+        self.get(name)
+        distribution = self._foreign()[name].dist
+        return f"{distribution.name} {distribution.version}" if distribution is not None else "unknown package"
+
+    def _foreign(self) -> dict[str, EntryPoint]:
+        """The entry points of other packages, by name.
+
+        Raises:
+            UsageError: two packages add one of the same name.
+        """
+        found: dict[str, EntryPoint] = {}
+        for entry in entry_points(group=self.group):
+            if entry.name in self._built_in:
+                raise UsageError(f"'{entry.value}' adds the {self.kind} '{entry.name}', which is built in; rename it")
+            if entry.name in found and found[entry.name].value != entry.value:
+                both = f"'{found[entry.name].value}' and '{entry.value}'"
+                raise UsageError(f"{both} both add the {self.kind} '{entry.name}'; uninstall one of their packages")
+            found[entry.name] = entry
+        return found
+
+    def _load(self, entry: EntryPoint) -> Item:
+        try:
+            item = entry.load()
+        except Exception as error:
+            why = f"{type(error).__name__}: {error}"
+            raise UsageError(f"{self.kind} '{entry.name}': '{entry.value}' cannot be imported ({why})") from error
+        if not isinstance(item, self._of):
+            raise UsageError(f"{self.kind} '{entry.name}': '{entry.value}' is no {self._of.__name__}")
+        return item
