@@ -17,6 +17,7 @@ from cluster.objects import objects_for
 from cluster.run_folder import ObjectsUsed, RunFolder, find
 from cluster.session import fleets
 from collector.guard import Limits
+from collector.setting import make_setting
 from shared.errors import UsageError
 from shared.methods import METHODS, MethodName
 from shared.plain import plain
@@ -38,12 +39,12 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
     policy = Policy.from_files(policies.read_policy(version))
     task = _task(config, settings.task)
     refs, folder = _objects(task, settings, run, used)
-    setting = Setting(
+    setting = make_setting(
+        task.name,
+        config.collection,
         kind="evaluation",
-        task=task.name,
         seed=config.seed if settings.seed is None else settings.seed,
         objects=refs,
-        collection=task.resolve(config.collection),
         evaluation=EvaluationConfig(
             methods=tuple(dict.fromkeys(settings.methods)) or _possible_methods(policy),
             budgets=tuple(sorted(set(settings.budgets))),
@@ -95,10 +96,10 @@ def _version(run: RunFolder, policies: Store, wanted: int | None) -> int:
 def _task(config: CampaignConfig, name: str | None) -> Task:
     """The task to evaluate on; the networks were trained for one primitive and know no other."""
     trained, task = task_named(config.task), task_named(name or config.task)
-    if task.primitive is not trained.primitive:
+    if task.primitive != trained.primitive:
         raise UsageError(
-            f"the run is trained to {trained.primitive.value} (task '{trained.name}'), and task '{task.name}' needs "
-            f"{task.primitive.value}; name a task of the same primitive"
+            f"the run is trained to {trained.primitive} (task '{trained.name}'), and task '{task.name}' needs "
+            f"{task.primitive}; name a task of the same primitive"
         )
     return task
 

@@ -166,7 +166,7 @@ def evaluate(
         StoreError: there is no QUERY row, or the data set is of a task with another primitive than a policy's.
     """
     for policy in policies.values():
-        if task_named(policy.task).primitive is not task_named(dataset.task).primitive:
+        if task_named(policy.task).primitive != task_named(dataset.task).primitive:
             raise StoreError(f"the store is of task '{dataset.task}', but a policy of '{policy.task}'")
         policy.modules().eval()
     judge = _Judge(dataset, policies)

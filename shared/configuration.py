@@ -3,20 +3,23 @@
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from shared.documents import MAX_PROBLEMS, MAX_WORD, printable
 from shared.errors import UsageError
 from shared.files import read_named
-from shared.vocabulary import Order, Primitive
+from shared.vocabulary import Order
 
 MAX_CONFIGURATION_BYTES = 1 << 18
 MAX_DOTS = 100
 """In a line of a configuration file, paths included."""
 
 Collision = Literal["hulls", "decomposed"]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")]
+"""Of something that a registry finds (`shared.extensions`); a store can be read where the package is not installed."""
+PANDA, SAPIEN = "panda", "sapien"
 
 
 class StrictModel(BaseModel):
@@ -174,8 +177,12 @@ class RolloutConfig(StrictModel):
 class CollectionConfig(StrictModel):
     """How interactions are collected, apart from which objects, how many, and by whom."""
 
-    primitive: Primitive | None = None
-    """Instead of the task's own primitive."""
+    primitive: Name | None = None
+    """Instead of the task's own: push, push-left, push-up, pull, pull-left, pull-up, or what a package adds."""
+    gripper: Name = Field(PANDA, exclude_if=lambda name: name == PANDA)
+    """The hand: panda, or what a package adds. Documents leave out the default, which they did not know once."""
+    simulator: Name = Field(SAPIEN, exclude_if=lambda name: name == SAPIEN)
+    """What rollouts are simulated with: sapien, or what a package adds; left out likewise."""
     camera: CameraConfig = CameraConfig()
     fidelity: Fidelity = Fidelity()
     collision: Collision = "hulls"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from shared.configuration import CollectionConfig, DynamicsRanges
 from shared.errors import UsageError
-from shared.vocabulary import Direction, Primitive
+from shared.vocabulary import Direction
 
 
 @dataclass(frozen=True, slots=True)
@@ -12,12 +12,12 @@ class Terms:
     """What a configuration says, or else its task: the one place where what is left to the task is looked up.
 
     Attributes:
-        primitive: what trials execute.
+        primitive: name of what trials execute.
         dynamics: what hidden dynamics are drawn from.
         edge_share: share of random actions at points near a part's edge.
     """
 
-    primitive: Primitive
+    primitive: str
     dynamics: DynamicsRanges
     edge_share: float
 
@@ -28,7 +28,7 @@ class Task:
 
     Attributes:
         name: what flags and rows call it.
-        primitive: the gripper primitive that it executes.
+        primitive: name of the gripper primitive that it executes.
         categories: the only categories that it applies to; empty: all.
         part_names: a movable part qualifies if its semantic name contains one of these; empty: all.
         revolute_only: whether only turning joints qualify.
@@ -40,7 +40,7 @@ class Task:
     """
 
     name: str
-    primitive: Primitive
+    primitive: str
     categories: tuple[str, ...] = ()
     part_names: tuple[str, ...] = ()
     revolute_only: bool = False
@@ -73,11 +73,11 @@ class Task:
 TASKS = {
     task.name: task
     for task in (
-        Task("push", Primitive.PUSH),
-        Task("pull", Primitive.PULL, edge_share=0.5),
+        Task("push", "push"),
+        Task("pull", "pull", edge_share=0.5),
         Task(
             "pull-closed-door",
-            Primitive.PULL,
+            "pull",
             categories=("StorageFurniture", "Cabinet"),
             part_names=("door",),
             revolute_only=True,
@@ -86,7 +86,7 @@ TASKS = {
         ),
         Task(
             "push-faucet",
-            Primitive.PUSH,
+            "push",
             categories=("Faucet",),
             part_names=("switch",),
             revolute_only=True,

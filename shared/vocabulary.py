@@ -26,22 +26,6 @@ Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 
-class Primitive(StrEnum):
-    """The six gripper primitives of Where2Act; each is a pure translation of the hand."""
-
-    PUSH = "push"
-    PUSH_LEFT = "push-left"
-    PUSH_UP = "push-up"
-    PULL = "pull"
-    PULL_LEFT = "pull-left"
-    PULL_UP = "pull-up"
-
-    @property
-    def pulls(self) -> bool:
-        """Whether the fingers start open and close after the approach."""
-        return self.value.startswith("pull")
-
-
 class OutcomeKind(StrEnum):
     """How a trial ended. Every kind but `ABANDONED` is an outcome of physics and so a label."""
 

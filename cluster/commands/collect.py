@@ -110,12 +110,14 @@ def _collect(command: CollectCommand) -> None:
     from cluster.objects import objects_for
     from cluster.session import fleets
     from collector.guard import Limits
-    from shared.plan import Plan, Setting
+    from collector.setting import make_setting, packages_used
+    from shared.plan import Plan
     from shared.store import Store
     from shared.store.place import absolute, folder_beside
     from shared.store.provenance import changed_versions
 
     chosen, where = command.settings, absolute(command.store)
+    packages_used(task_named(chosen.task), chosen.collection)  # Refused before any object is read.
     catalogue, folder = objects_for(
         task_named(chosen.task),
         chosen,
@@ -123,11 +125,11 @@ def _collect(command: CollectCommand) -> None:
         chosen.procedural_per_category,
         chosen.seed,
     )
-    setting = Setting(
-        task=chosen.task,
+    setting = make_setting(
+        chosen.task,
+        chosen.collection,
         seed=chosen.seed,
         objects=_begun_with(where, tuple(entry.ref for entry in catalogue.usable)),
-        collection=task_named(chosen.task).resolve(chosen.collection),
     )
     store = Store.create(where, setting)
     if changed := changed_versions(store.document.software):
