@@ -14,6 +14,7 @@ from collector.camera import DepthImage, EmbreeCamera
 from collector.clock import StageClock
 from collector.engine import Link, convex_shapes
 from collector.environment import SapienEnvironment
+from collector.grippers import GRIPPERS
 from collector.preview import part_colours, save, shaded
 from collector.primitives import Trial
 from collector.proposers import RandomProposer
@@ -124,8 +125,12 @@ def film(
         The caption of each trial.
 
     Raises:
-        UsageError: no camera sees a part that moves, or the file cannot be written.
+        UsageError: something is not found by its name, no camera sees a part that moves, or the file cannot be
+            written.
     """
+    GRIPPERS.get(gripper)
+    for primitive in primitives:
+        PRIMITIVES.get(primitive)
     takes = [_best_take(target, primitive, gripper, seed) for primitive in primitives]
     across = 1 if len(takes) < 4 else 2
     rows = int(np.ceil(len(takes) / across))

@@ -5,6 +5,7 @@ from typing import Any
 from collector.grippers import GRIPPERS
 from collector.simulator import SIMULATORS
 from shared.configuration import CollectionConfig
+from shared.errors import UsageError
 from shared.extensions import added_by_packages
 from shared.plan import Setting
 from shared.primitives import PRIMITIVES
@@ -40,3 +41,15 @@ def packages_used(task: Task, collection: CollectionConfig) -> tuple[str, ...]:
             (SIMULATORS, collection.simulator),
         ]
     )
+
+
+def check_packages(setting: Setting) -> None:
+    """Hold what is installed on this machine to the packages that a setting names.
+
+    Raises:
+        UsageError: it needs others, or other versions of them.
+    """
+    here = packages_used(task_named(setting.task), setting.collection)
+    if here != setting.extensions:
+        wanted, found = ("; ".join(packages) or "no package" for packages in (setting.extensions, here))
+        raise UsageError(f"the store is of {wanted}, but here is {found}; install the same on every machine")

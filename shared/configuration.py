@@ -122,7 +122,7 @@ class Fidelity(StrictModel):
     drag: Timing = Timing(steps_per_second=240, leg_steps=480, hold_steps=480)
     """The second leg of every primitive but push: whether what is pinched or dragged slips hangs on its speed."""
     push_solver_iterations: int = Field(10, ge=1, le=255)
-    """Of the engine, for pushes."""
+    """Of the engine, for the primitive push, and for others that do not need friction."""
     solver_iterations: int = Field(20, ge=1, le=255)
     """For all other primitives, since friction between fingers and part needs more."""
     skip_free_flight: bool = True

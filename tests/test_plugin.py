@@ -11,6 +11,7 @@ import pytest
 
 from cluster.cli import run
 from collector.articulation import ArticulatedObject, Body, Joint
+from collector.grippers import GRIPPERS
 from collector.primitives import Trial
 from collector.scene import Scene
 from shared.configuration import FIDELITIES
@@ -44,8 +45,10 @@ def install(folder: Path) -> None:
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The package installed in this process alone."""
+    """The package installed in this process, for one test."""
     install(tmp_path)
+    for registry in (PRIMITIVES, GRIPPERS):
+        monkeypatch.setattr(registry, "_loaded", {})
     monkeypatch.syspath_prepend(tmp_path)
 
 

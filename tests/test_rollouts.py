@@ -91,6 +91,13 @@ def test_the_digest_does_not_depend_on_shards_order_or_age_of_the_worker(objects
     assert digests[0] == digests[1]
 
 
+def test_a_worker_without_the_packages_of_a_setting_does_nothing(objects: Path, tmp_path: Path) -> None:
+    plan = plan_for(objects, extensions=("primitive twist: my-package 1.2",))
+    worker = Worker(Store.create(tmp_path / "store", plan.setting).path, objects)
+    with pytest.raises(UsageError, match=r"is of primitive twist: my-package 1\.2, but here is no package; install"):
+        worker.run(plan, Job(plan.key, 0, 1))
+
+
 def test_a_job_done_twice_is_done_once(objects: Path, tmp_path: Path) -> None:
     plan = plan_for(objects)
     store = Store.create(tmp_path / "store", plan.setting)
