@@ -1,7 +1,7 @@
 """What a rollout needs of a simulator, whichever physics it computes, and the simulators that there are, by name."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -93,19 +93,11 @@ class Simulator:
     make: MakeEnvironment
 
 
-def _sapien(
-    target: ArticulatedObject,
-    task: Task,
-    collection: CollectionConfig,
-    dynamics: HiddenDynamics,
-    world_from_camera: Float,
-    rng: np.random.Generator,
-    clock: StageClock,
-) -> SimEnvironment:
+def _sapien(*args: Any, **named: Any) -> SimEnvironment:
     # Loads the engine, which rollouts of other simulators do not need.
     from collector.environment import SapienEnvironment
 
-    return SapienEnvironment(target, task, collection, dynamics, world_from_camera, rng, clock)
+    return SapienEnvironment(*args, **named)
 
 
 SIMULATORS = Registry("simulator", Simulator, {SAPIEN: Simulator(_sapien)})
