@@ -13,8 +13,6 @@ from shared.plain import plain
 from shared.vocabulary import Primitive
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from collector.catalogue import CatalogueEntry
 
 ACTIONS = ("generate", "check", "preview", "film", "decompose")
@@ -180,37 +178,27 @@ def _film(command: FilmCommand) -> int:
 
 
 def _decompose(command: DecomposeCommand) -> int:
-    from rich.progress import Progress, TaskID
-
     from collector.catalogue import load, scan
     from collector.decomposition import Decomposer
     from shared.errors import ObjectError
     from shared.private import cache_folder
+    from shared.progress import Progress
 
     usable, failed = scan(command.path).usable, 0
-    with Decomposer(cache_folder("pieces")) as decomposer, Progress(transient=True) as bar:
+    with Decomposer(cache_folder("pieces")) as decomposer:
         for number, entry in enumerate(usable, start=1):
-            task = bar.add_task(f"{entry.ref.id} ({number} of {len(usable)})", total=None)
-
-            def show(done: int, total: int, task: TaskID = task) -> None:
-                bar.update(task, completed=done, total=total)
-
             try:
                 target = load(entry)
-                opened = decomposer.decomposed(target, show)
+                with Progress(f"{entry.ref.id} ({number} of {len(usable)}), meshes") as progress:
+                    opened = decomposer.decomposed(target, progress.show)
             except ObjectError as error:
                 failed += 1
-                _say(bar.console, f"{entry.ref.id}  refused: {error}")
+                print(plain(f"{entry.ref.id}  refused: {error}"))
             else:
                 meshes, pieces = (sum(len(body.collisions) for body in o.bodies) for o in (target, opened))
-                _say(bar.console, f"{entry.ref.id}  {meshes} meshes, {pieces} convex pieces")
-            bar.remove_task(task)
+                print(plain(f"{entry.ref.id}  {meshes} meshes, {pieces} convex pieces"))
     print(f"{len(usable) - failed} decomposed into {cache_folder('pieces')}, {failed} refused")
     return 0 if failed < len(usable) else UsageError.exit_code
-
-
-def _say(console: "Console", line: str) -> None:
-    console.print(plain(line), markup=False, highlight=False, soft_wrap=True)
 
 
 def _parts(count: int) -> str:

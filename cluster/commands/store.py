@@ -14,6 +14,7 @@ import tyro
 from cluster.settings import parse_flags
 from shared.errors import UsageError
 from shared.plain import plain
+from shared.progress import Progress
 
 if TYPE_CHECKING:
     from cluster.resimulation import Divergence
@@ -161,14 +162,13 @@ def _info(command: InfoCommand) -> int:
 
 
 def _verify(command: VerifyCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.store import Store, verify
 
     if command.resimulate < 0 or (command.resimulate > 0) != (command.objects is not None):
         raise UsageError("--resimulate N (1 or more) needs --objects FOLDER, and the other way round")
     store = Store.open(command.store)
-    with advancing("verifying, shards") as advance:
-        problems = verify(store, advance)
+    with Progress("verifying, shards") as progress:
+        problems = verify(store, progress.show)
     said: dict[str, Any] = {"ok": not problems, "problems": [asdict(problem) for problem in problems]}
     divergence = None
     if command.objects is not None and not problems:
@@ -186,11 +186,10 @@ def _verify(command: VerifyCommand) -> int:
 
 
 def _resimulated(store: "Store", objects: Path, command: VerifyCommand) -> "Divergence":
-    from cluster.benchmarks.progress import progress
     from cluster.resimulation import resimulate
 
-    with progress("executing rows again", command.resimulate) as advance:
-        return resimulate(store, objects, command.resimulate, command.seed, advance)
+    with Progress("executing rows again", command.resimulate) as progress:
+        return resimulate(store, objects, command.resimulate, command.seed, progress.advance)
 
 
 def _as_json(divergence: "Divergence") -> dict[str, Any]:

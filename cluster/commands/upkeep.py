@@ -10,6 +10,7 @@ import tyro
 from cluster.settings import parse_flags
 from shared.errors import StoreError, UsageError
 from shared.plain import plain
+from shared.progress import Progress
 
 MOST_SHOWN = 20
 """Lines of one kind that are printed; --json has all."""
@@ -131,13 +132,12 @@ def _refuse_while_collecting(where: str) -> None:
 
 
 def _repair(command: RepairCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.reproduction import reproduction
     from shared.store import repair
 
     _refuse_while_collecting(command.store)
-    with advancing("verifying, shards") as advance:
-        store, done = repair(command.store, advance)
+    with Progress("verifying, shards") as progress:
+        store, done = repair(command.store, progress.show)
     commands = [reproduction(store.where, job.shard_id, "OBJECTS") for job in done.to_collect]
     if command.json:
         jobs = [job.shard_id for job in done.to_collect]
@@ -160,13 +160,12 @@ def _repair(command: RepairCommand) -> int:
 
 
 def _compact(command: CompactCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.store import Store, compact
 
     store = Store.open(command.store)
     _refuse_while_collecting(command.store)
-    with advancing("compacting, shards") as advance:
-        done = compact(store, command.rollouts, advance)
+    with Progress("compacting, shards") as progress:
+        done = compact(store, command.rollouts, progress.show)
     if command.json:
         print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
         return 0
@@ -175,14 +174,13 @@ def _compact(command: CompactCommand) -> int:
 
 
 def _merge(command: MergeCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.store import Store, merge
 
     if not command.stores:
         raise UsageError("store merge needs one store or more, and --out")
     _refuse_while_collecting(command.out)
-    with advancing("merging, shards") as advance:
-        store, done = merge([Store.open(where) for where in command.stores], command.out, advance)
+    with Progress(f"merging into {command.out}, shards") as progress:
+        store, done = merge([Store.open(where) for where in command.stores], command.out, progress.show)
     if command.json:
         print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
         return 0
@@ -192,7 +190,6 @@ def _merge(command: MergeCommand) -> int:
 
 
 def _export(command: ExportCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from learner.data import read_object_list
     from shared.store import Store, export
     from shared.store.export import splits_by_share
@@ -202,8 +199,10 @@ def _export(command: ExportCommand) -> int:
     splits = {name: objects for name, objects in lists.items() if objects is not None}
     if splits and command.test_share:
         raise UsageError("--test-share and lists of objects exclude each other; give one")
-    with advancing("exporting, shards") as advance:
-        done = export(store, command.out, splits or splits_by_share(store, command.test_share, command.seed), advance)
+    with Progress(f"exporting into {command.out}, shards") as progress:
+        done = export(
+            store, command.out, splits or splits_by_share(store, command.test_share, command.seed), progress.show
+        )
     if command.json:
         described = {
             name: asdict(figures) | {"objects": sorted(figures.objects)} for name, figures in done.splits.items()
@@ -217,11 +216,10 @@ def _export(command: ExportCommand) -> int:
 
 
 def _migrate(command: MigrateCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.store import migrate
 
-    with advancing("migrating, shards") as advance:
-        done = migrate(command.store, command.out, advance)
+    with Progress(f"migrating into {command.out}, shards") as progress:
+        done = migrate(command.store, command.out, progress.show)
     if command.json:
         print(json.dumps(asdict(done), indent=2))
         return 0
