@@ -26,6 +26,7 @@ from learner.hardware import Hardware
 from learner.names import METRICS_FILE
 from shared.errors import UsageError
 from shared.files import read_bounded
+from shared.formatting import finite
 from shared.progress import Progress, minutes
 from shared.seeds import generator
 
@@ -252,8 +253,8 @@ class _Loop:
         }
         if self._viewer is not None:
             with (self.out / METRICS_FILE).open("a", encoding="utf-8") as file:
-                file.write(json.dumps(without_nan(line)) + "\n")
-            self._viewer.add(self.cursor.step, without_nan(line))
+                file.write(json.dumps(finite(line)) + "\n")
+            self._viewer.add(self.cursor.step, finite(line))
 
     def _save(self) -> None:
         if sharing.rank() > 0:
@@ -291,13 +292,6 @@ def rate_factor(config: TrainingConfig, step: int) -> float:
     if done < WARMING:
         return done / WARMING
     return 0.5 * (1.0 + math.cos(math.pi * (done - WARMING) / (1.0 - WARMING)))
-
-
-def without_nan(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values with null for what is not a number, which JSON cannot say."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()
-    }
 
 
 def _parsed(line: str) -> dict[str, Any] | None:

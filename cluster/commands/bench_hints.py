@@ -8,10 +8,10 @@ from typing import Annotated, Any
 import tyro
 from pydantic import Field
 
-from cluster.cells import percent
 from cluster.commands.bench import check_picture, finish
 from cluster.commands.bench_learner import StoredSettings, source_of, stored
 from cluster.settings import parse_flags
+from shared.formatting import percent
 from shared.progress import Progress
 
 

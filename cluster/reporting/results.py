@@ -8,7 +8,6 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from pydantic import BaseModel, ConfigDict, Field
 
-from cluster.cells import number, percent
 from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, WITHOUT_TRIES, Measure
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
 from cluster.reporting.published import published, published_figure
@@ -16,6 +15,7 @@ from cluster.reporting.style import COLOURS, SOFT, laid_out
 from cluster.run_folder import read_json
 from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD
 from shared.configuration import parse
+from shared.formatting import number, percent
 
 
 class ResultRow(BaseModel):
