@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 from cluster.orders import Order, Orders
 from shared.errors import WorkerError
+from shared.plain import plain
 from shared.plan import Job
 from shared.redaction import without_secrets
 
@@ -249,6 +250,5 @@ class Backlog:
 
 def describe(error: BaseException) -> str:
     """An exception in one line of bounded length."""
-    said = without_secrets(" ".join(str(error).split()))
-    text = "".join(letter for letter in said if letter.isprintable())[:300]
+    text = plain(without_secrets(" ".join(str(error).split())), 300)
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -46,23 +46,6 @@ class Orders(Protocol):
         ...
 
 
-class Listed:
-    """Jobs of one plan that are known beforehand."""
-
-    def __init__(self, plan: Plan, jobs: Sequence[Job]) -> None:
-        self._left = [Order(plan, job) for job in reversed(jobs)]
-        self.any_done = False
-
-    @property
-    def ended(self) -> bool:
-        """See `Orders.ended`."""
-        return not self._left
-
-    def take(self) -> Order | None:
-        """See `Orders.take`."""
-        return self._left.pop() if self._left else None
-
-
 class Series:
     """The rollouts of one proposer that are left to do.
 

@@ -110,16 +110,3 @@ def parse_flags(command: type[Command], args: list[str], prog: str, default: Com
         raise UsageError(f"flag for '{name}': {problem['msg']}; given {str(problem['input'])[:80]!r}") from None
     assert parsed is not None
     return parsed
-
-
-def difference(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> str | None:
-    """The first setting in which two configurations differ, as "name: before, now after"; None if they agree."""
-    for key in sorted(before.keys() | after.keys()):
-        old, new = before.get(key), after.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            found = difference(old, new, f"{prefix}{key}.")
-            if found:
-                return found
-        elif old != new:
-            return f"'{prefix}{key}' was {old!r}, is now {new!r}"
-    return None
