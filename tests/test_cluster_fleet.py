@@ -19,7 +19,7 @@ import pytest
 
 from cluster.blame import MAX_FAULTS, MAX_LOSSES
 from cluster.fleet import Fleet, SerialFleet
-from cluster.orders import Order
+from cluster.orders import PlannedJob
 from cluster.ray_fleet import RayFleet
 from cluster.seats import IN_FLIGHT
 from cluster.session import fleets, ray_session
@@ -65,14 +65,14 @@ class Listed:
     """Jobs of one plan that are known beforehand."""
 
     def __init__(self, plan: Plan, jobs: Sequence[Job]) -> None:
-        self._left = [Order(plan, job) for job in reversed(jobs)]
+        self._left = [PlannedJob(plan, job) for job in reversed(jobs)]
         self.any_done = False
 
     @property
     def ended(self) -> bool:
         return not self._left
 
-    def take(self) -> Order | None:
+    def take(self) -> PlannedJob | None:
         return self._left.pop() if self._left else None
 
 
@@ -141,7 +141,7 @@ class Slow(Listed):
         self.asked = 0
         self.taken = 0
 
-    def take(self) -> Order | None:
+    def take(self) -> PlannedJob | None:
         self.asked += 1
         if self.asked % 2:
             return None

@@ -121,7 +121,7 @@ def main(args: list[str]) -> int:
 
 
 def _info(command: InfoCommand) -> int:
-    from shared.store import Store, Tally, info
+    from shared.store import Store, SuccessCount, info
 
     store = Store.open(command.store)
     held = info(store)
@@ -138,7 +138,7 @@ def _info(command: InfoCommand) -> int:
         print(json.dumps(finite(described), indent=2, allow_nan=False))
         return 0
 
-    def tallies(counts: dict[str, Tally]) -> str:
+    def tallies(counts: dict[str, SuccessCount]) -> str:
         each = [f"{plain(name)} {tally.interactions} ({tally.success_rate:.1%})" for name, tally in counts.items()]
         return ", ".join(each) or "none"
 
