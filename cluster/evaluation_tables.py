@@ -11,6 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import BaseModel, ConfigDict, Field
+
 from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
 from shared.files import write_atomically
 from shared.formatting import csv_table, markdown_table, percent
@@ -44,6 +46,52 @@ BEST_METHOD: MethodName = "ours-final"
 WITHOUT_TRIES = (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD)
 ORDER = (*METHODS, NO_TRIES_METHOD, ORACLE_METHOD)
 """Of rows: as in the paper's tables, and then what stands beside them."""
+
+
+class ResultRow(BaseModel):
+    """A row of results.json: a method after a budget. See `learner.evaluation.EvaluationRow`."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    method: str = Field(max_length=100)
+    budget: int
+    f_score: float | None
+    f_score_low: float | None = None
+    f_score_high: float | None = None
+    sample_success: float | None
+    sample_success_low: float | None = None
+    sample_success_high: float | None = None
+    start_success: float | None = None
+    start_success_low: float | None = None
+    start_success_high: float | None = None
+    trials: int
+    gap_closed: float | None = None
+    best_f: float | None
+    bce: float | None
+    auc: float | None
+    base_rate: float | None
+    queries: int
+    mean_tries: float | None
+
+    def value(self, measure: Measure) -> float | None:
+        """One of the measures."""
+        found: float | None = getattr(self, measure)
+        return found
+
+    def interval(self, measure: Measure) -> tuple[float, float] | None:
+        """The limits of its 95% interval; None where it has none."""
+        low, high = (getattr(self, f"{measure}_{end}") for end in ("low", "high"))
+        return None if low is None or high is None else (low, high)
+
+
+class ResultRows(BaseModel):
+    """What is read of results.json."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    task: str = Field("", max_length=100)
+    objects: int = Field(ge=0)
+    rows: tuple[ResultRow, ...]
 
 
 @dataclass(frozen=True, slots=True)

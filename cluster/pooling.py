@@ -15,9 +15,18 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import model_validator
 
-from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, RESULTS_FILE, WITHOUT_TRIES, share_of_gap
+from cluster.evaluation_tables import (
+    BEST_METHOD,
+    MEASURES,
+    ORDER,
+    RESULTS_FILE,
+    WITHOUT_TRIES,
+    ResultRow,
+    ResultRows,
+    share_of_gap,
+)
 from cluster.reporting.published import PUBLISHED_MEASURES, published_figure
 from cluster.reporting.style import COLOURS, SOFT
 from cluster.run_folder import RunFolder, find, read_json
@@ -44,16 +53,7 @@ COLUMNS = (
 _COUNTED = tuple(field.name for field in fields(ObjectCounts) if field.name != "object")
 
 
-class _Row(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
-
-    method: str = Field(max_length=100)
-    budget: int
-    best_f: float | None
-    bce: float | None
-    auc: float | None
-    base_rate: float | None
-    mean_tries: float | None
+class _Row(ResultRow):
     counts: ObjectCounts
 
     @model_validator(mode="after")
@@ -66,12 +66,7 @@ class _Row(BaseModel):
         return self
 
 
-class _Results(BaseModel):
-    """What is read of results.json."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    task: str = Field(max_length=100)
+class _Results(ResultRows):
     seed: int
     rollouts: int
     contents: Mapping[str, str]

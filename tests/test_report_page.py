@@ -19,6 +19,7 @@ import pytest
 from cluster.cli import run as run_command
 from cluster.configuration import CampaignConfig
 from cluster.episodes import Episode, first_episodes, most_telling
+from cluster.evaluation_tables import ResultRow
 from cluster.ledger import Ledger
 from cluster.reporting.clouds import TANGENT, CloudView, draw_panels, tried
 from cluster.reporting.collecting import wilson
@@ -26,7 +27,7 @@ from cluster.reporting.failures import FailedExploit, varied
 from cluster.reporting.laboratory import Laboratory, hinge_twins, variations
 from cluster.reporting.page import MAX_TEXT, Drawing, Page, Section, plain, render, shortened
 from cluster.reporting.published import published
-from cluster.reporting.results import ResultRow, Results, table_of
+from cluster.reporting.results import Results, table_of
 from cluster.reporting.training import after_tries, curves_of, read_entries
 from cluster.run_folder import ObjectsUsed, RunFolder, begin
 from shared.adaptation import Adapter

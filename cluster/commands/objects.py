@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from pydantic import Field
 
-from cluster.settings import parse_flags
+from cluster.settings import Action, dispatch
 from shared.errors import UsageError
 from shared.plain import plain
 from shared.vocabulary import Primitive
 
 if TYPE_CHECKING:
     from collector.catalogue import CatalogueEntry
-
-ACTIONS = ("generate", "check", "preview", "film", "decompose")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,26 +78,6 @@ class DecomposeCommand:
 
     path: Annotated[Path, tyro.conf.Positional]
     """A folder of objects, or one object's folder."""
-
-
-def main(args: list[str]) -> int:
-    """Dispatch."""
-    match args[:1]:
-        case ["generate"]:
-            return _generate(parse_flags(GenerateCommand, args[1:], "objects generate"))
-        case ["check"]:
-            return _check(parse_flags(CheckCommand, args[1:], "objects check"))
-        case ["preview"]:
-            return _preview(parse_flags(PreviewCommand, args[1:], "objects preview"))
-        case ["film"]:
-            return _film(parse_flags(FilmCommand, args[1:], "objects film"))
-        case ["decompose"]:
-            return _decompose(parse_flags(DecomposeCommand, args[1:], "objects decompose"))
-        case ["-h" | "--help"]:
-            print(f"usage: adaafford objects {{{','.join(ACTIONS)}}} PATH; `adaafford objects check --help` tells more")
-            return 0
-    given = f"'{args[0]}'" if args else "nothing"
-    raise UsageError(f"objects needs one of {', '.join(ACTIONS)}; given {given}")
 
 
 def _generate(command: GenerateCommand) -> int:
@@ -203,3 +181,17 @@ def _decompose(command: DecomposeCommand) -> int:
 
 def _parts(count: int) -> str:
     return f"{count} movable part{'' if count == 1 else 's'}"
+
+
+ACTIONS: dict[str, Action] = {
+    "generate": (GenerateCommand, _generate),
+    "check": (CheckCommand, _check),
+    "preview": (PreviewCommand, _preview),
+    "film": (FilmCommand, _film),
+    "decompose": (DecomposeCommand, _decompose),
+}
+
+
+def main(args: list[str]) -> int:
+    """Run one of the actions."""
+    return dispatch("objects", ACTIONS, args, "PATH")

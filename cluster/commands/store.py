@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cluster.settings import parse_flags
+from cluster.commands import upkeep
+from cluster.settings import Action, dispatch
 from shared.errors import UsageError
 from shared.formatting import finite
 from shared.plain import plain
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from shared.records import RolloutRecord
     from shared.store import Store
 
-ACTIONS = ("info", "verify", "digest", "replay", "repair", "compact", "merge", "export", "migrate", "check-place")
 MOST_WRITERS, MOST_ROUNDS = 64, 10_000
 MOST_QUARANTINED = 20
 """Quarantined rollouts that `info` lists as text; `--json` lists all."""
@@ -94,30 +94,6 @@ class CheckPlaceCommand:
     """Files that are written."""
     writers: int = 16
     """Concurrent writers of each file."""
-
-
-def main(args: list[str]) -> int:
-    """Dispatch."""
-    match args[:1]:
-        case ["info"]:
-            return _info(parse_flags(InfoCommand, args[1:], "store info"))
-        case ["verify"]:
-            return _verify(parse_flags(VerifyCommand, args[1:], "store verify"))
-        case ["repair" | "compact" | "merge" | "export" | "migrate"]:
-            from cluster.commands import upkeep
-
-            return upkeep.main(args)
-        case ["digest"]:
-            return _digest(parse_flags(DigestCommand, args[1:], "store digest"))
-        case ["replay"]:
-            return _replay(parse_flags(ReplayCommand, args[1:], "store replay"))
-        case ["check-place"]:
-            return _check_place(parse_flags(CheckPlaceCommand, args[1:], "store check-place"))
-        case ["-h" | "--help"]:
-            print(f"usage: adaafford store {{{','.join(ACTIONS)}}} STORE; `adaafford store info --help` tells more")
-            return 0
-    given = f"'{args[0]}'" if args else "nothing"
-    raise UsageError(f"store needs one of {', '.join(ACTIONS)}; given {given}")
 
 
 def _info(command: InfoCommand) -> int:
@@ -283,3 +259,18 @@ def _check_place(command: CheckPlaceCommand) -> int:
         raise StoreError(f"{command.place}: cannot be used ({error.strerror}); name another place") from None
     print(f"{place.where}: no problems in {command.rounds} rounds of {command.writers} concurrent writers")
     return 0
+
+
+ACTIONS: dict[str, Action] = {
+    "info": (InfoCommand, _info),
+    "verify": (VerifyCommand, _verify),
+    "digest": (DigestCommand, _digest),
+    "replay": (ReplayCommand, _replay),
+    **upkeep.ACTIONS,
+    "check-place": (CheckPlaceCommand, _check_place),
+}
+
+
+def main(args: list[str]) -> int:
+    """Run one of the actions."""
+    return dispatch("store", ACTIONS, args, "STORE")

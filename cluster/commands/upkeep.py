@@ -1,13 +1,14 @@
 """`adaafford store repair|compact|merge|export|migrate`: what makes stores out of stores."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from cluster.settings import parse_flags
+from cluster.settings import Action
 from shared.errors import StoreError, UsageError
 from shared.plain import plain
 from shared.progress import Progress
@@ -82,34 +83,19 @@ class MigrateCommand:
     """Print one JSON object instead of text."""
 
 
-def main(args: list[str]) -> int:
-    """Dispatch; `args` begin with the action.
+def _writing(execute: Callable[[Any], int]) -> Callable[[Any], int]:
+    """An action that says in one line what the disk refused; nothing is lost by that, and the same command goes on."""
 
-    Raises:
-        StoreError: the disk refuses something; nothing is lost by that, and the same command goes on.
-    """
-    try:
-        return _dispatch(args)
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        raise StoreError(
-            f"{where}cannot be written ({error.strerror or error}); check space and permissions, then repeat it"
-        ) from None
+    def run(command: Any) -> int:
+        try:
+            return execute(command)
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            raise StoreError(
+                f"{where}cannot be written ({error.strerror or error}); check space and permissions, then repeat it"
+            ) from None
 
-
-def _dispatch(args: list[str]) -> int:
-    match args[0]:
-        case "repair":
-            return _repair(parse_flags(RepairCommand, args[1:], "store repair"))
-        case "compact":
-            return _compact(parse_flags(CompactCommand, args[1:], "store compact"))
-        case "merge":
-            return _merge(parse_flags(MergeCommand, args[1:], "store merge"))
-        case "export":
-            return _export(parse_flags(ExportCommand, args[1:], "store export"))
-        case "migrate":
-            return _migrate(parse_flags(MigrateCommand, args[1:], "store migrate"))
-    raise UsageError(f"no action '{args[0]}'")
+    return run
 
 
 def _refuse_while_collecting(where: str) -> None:
@@ -226,3 +212,12 @@ def _migrate(command: MigrateCommand) -> int:
     print(f"{done.shards} shards of schema version {done.version} written anew, digest {done.digest}")
     print(f"into {command.out}; {command.store} stays as it is")
     return 0
+
+
+ACTIONS: dict[str, Action] = {
+    "repair": (RepairCommand, _writing(_repair)),
+    "compact": (CompactCommand, _writing(_compact)),
+    "merge": (MergeCommand, _writing(_merge)),
+    "export": (ExportCommand, _writing(_export)),
+    "migrate": (MigrateCommand, _writing(_migrate)),
+}
