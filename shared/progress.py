@@ -61,6 +61,9 @@ class Progress:
         self._say = say or self._print
         self._bar: Bar | None = None
         self._most_left_s = math.inf
+        self._begun: float
+        self._last_line: float
+        self._begun_at: int
         self._begin(done)
 
     def __enter__(self) -> "Progress":
