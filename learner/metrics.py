@@ -128,7 +128,7 @@ def correlation(values: ArrayLike, others: ArrayLike) -> float:
     pair = np.array([values, others], dtype=np.float64)
     if pair.shape[1] < 2 or (pair.std(axis=1) == 0).any():
         return float("nan")
-    return float(np.corrcoef(pair)[0, 1])
+    return float(np.asarray(np.corrcoef(pair))[0, 1])
 
 
 def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -24,11 +24,10 @@ from pydantic import BaseModel, Field
 
 from learner import sharing
 from learner.checkpoint import check_fingerprint, read_cursor
-from learner.configuration import LearnerConfig
+from learner.configuration import METRICS_FILE, LearnerConfig
 from learner.data import Dataset, Split, load_dataset, split, without_later
 from learner.features import FrozenFeatures
 from learner.hardware import Hardware
-from learner.names import METRICS_FILE
 from learner.oracle import read_oracle
 from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FILE, ORACLE_FOLDER, Recipe, Runner
 from learner.training import CHECKPOINT_FILE, TrainingResult

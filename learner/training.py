@@ -20,10 +20,9 @@ from torch.nn.parallel import DistributedDataParallel
 
 from learner import sharing
 from learner.checkpoint import Cursor, check_fingerprint, read_checkpoint, read_cursor, write_checkpoint
-from learner.configuration import TrainingConfig
+from learner.configuration import METRICS_FILE, TrainingConfig
 from learner.events import EVENTS_FOLDER, EventFiles
 from learner.hardware import Hardware
-from learner.names import METRICS_FILE
 from shared.errors import UsageError
 from shared.files import read_bounded
 from shared.formatting import finite

@@ -23,10 +23,9 @@ from cluster.children import OUTPUT_FILE, Learner
 from cluster.cli import INTERRUPTED, run
 from cluster.training import as_toml
 from learner.alternation import ALTERNATION_FILE, alternate, converged
-from learner.configuration import AlternationConfig, LearnerConfig
+from learner.configuration import METRICS_FILE, AlternationConfig, LearnerConfig
 from learner.data import load_dataset, split, without_later
 from learner.hardware import Hardware
-from learner.names import METRICS_FILE
 from learner.stages import DONE_FILE, LOCK_FILE, StageJob, read_policy_folder, run_stage
 from learner.training import CHECKPOINT_FILE
 from shared.errors import UsageError, WorkerError
