@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rich.progress import Task
 
 LINE_EVERY_S = 5.0
+BAR_WIDTH = 20
 Advance = Callable[[], None]
 """Says that one more is done."""
 
@@ -74,7 +75,7 @@ class Progress:
                 f"{self.title}: {self.done} of {self.total}{self._unit} are there, {left} left; into {self._leaves}"
             )
         if self._live and (self.done < self.total or not self.total):
-            columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), _Described(self)
+            columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(BAR_WIDTH), _Described(self)
             self._bar = Bar(*columns, console=self._console, transient=True)
             self._bar.add_task(plain(self.title), total=self.total or None, completed=self.done)
             self._bar.start()
@@ -116,7 +117,7 @@ class Progress:
 
     def describe(self) -> str:
         """Done and left, details, and the time left at the pace so far, in one line."""
-        parts = [f"{self.done}/{self.total}{self._unit}"]
+        parts = [f"{self.done}/{self.total}{self._unit}"] if self.total else []
         if self._details is not None:
             parts.append(self._details())
         if self._begun_at < self.done < self.total:
