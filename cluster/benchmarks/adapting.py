@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from cluster.benchmarks.progress import Advance
 from shared.adaptation import Adapter
 from shared.errors import UsageError
 from shared.observation import round_points
 from shared.policy import Policy
+from shared.progress import Advance
 from shared.proposers import AipProposer
 from shared.store import Store
 from shared.vocabulary import Interaction, Observation, Outcome, OutcomeKind

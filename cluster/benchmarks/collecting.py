@@ -11,7 +11,6 @@ from statistics import mean, median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cluster.benchmarks.progress import Advance
 from cluster.progress import Tally
 from collector.partnet import urdf_of
 from collector.published import PublishedRequest, PublishedTiming
@@ -19,6 +18,7 @@ from collector.worker import Worker
 from shared.errors import UsageError, WorkerError
 from shared.interpreter import PYTHON, own_environment
 from shared.plan import ROLLOUTS_PER_SHARD, Job, Plan, missing_jobs
+from shared.progress import Advance
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store, info
 

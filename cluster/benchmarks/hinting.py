@@ -14,13 +14,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from cluster.benchmarks.progress import Advance
 from cluster.picture import Panel, draw_panels
 from cluster.reporting.words import verdict
 from learner.bootstrap import ratio_interval
 from shared.adaptation import Adapter
 from shared.errors import UsageError
 from shared.policy import Policy
+from shared.progress import Advance
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
 from shared.vocabulary import Float, Float32, Interaction, Observation, Outcome

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cluster.benchmarks.progress import Advance
 from cluster.benchmarks.straightforward import POINTS, PublishedStep
 from learner.aap import AapStage, OracleStage
 from learner.aip import AipStage
@@ -28,6 +27,7 @@ from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
 from learner.training import Stage, train
 from shared.policy import Policy
+from shared.progress import Advance
 from shared.seeds import generator
 from shared.store import Store
 

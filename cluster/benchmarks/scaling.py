@@ -19,7 +19,6 @@ import numpy as np
 import psutil
 
 from cluster.benchmarks.listing import StorePoint
-from cluster.benchmarks.progress import Advance
 from cluster.benchmarks.sleeping import Dormitories, Sleeper
 from cluster.orders import Series
 from cluster.progress import CollectionProgress
@@ -28,6 +27,7 @@ from cluster.session import ray_session
 from collector.guard import Limits
 from collector.receipt import Receipt
 from shared.plan import Plan
+from shared.progress import Advance
 from shared.underway import Underway
 
 BEDS = 100

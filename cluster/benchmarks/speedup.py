@@ -8,13 +8,13 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cluster.benchmarks.progress import Advance
 from cluster.fleet import make_worker
 from cluster.orders import Series
 from cluster.ray_fleet import RayFleet
 from cluster.session import ray_session
 from collector.guard import Limits
 from shared.plan import ROLLOUTS_PER_SHARD, Plan
+from shared.progress import Advance
 from shared.store import Store
 
 

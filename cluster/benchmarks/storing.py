@@ -12,10 +12,10 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cluster.benchmarks.progress import Advance
 from cluster.benchmarks.s3_server import loopback_bucket
 from shared.errors import StoreError
 from shared.plan import Job
+from shared.progress import Advance
 from shared.records import RolloutRecord
 from shared.store import Store, info
 from shared.store.layout import MAX_DOCUMENT_BYTES, SHARDS_FOLDER

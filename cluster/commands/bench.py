@@ -156,10 +156,10 @@ def _dispatch(args: list[str]) -> int:
 
 def _fidelity(command: FidelitySettings) -> int:
     from cluster.benchmarks.fidelity import compare
-    from cluster.benchmarks.progress import progress
+    from shared.progress import Progress
 
-    with planned(command) as (plan, folder), progress(f"trials, {command.task}", command.trials) as advance:
-        result = compare(plan, folder, command.reference, command.candidate, command.trials, advance)
+    with planned(command) as (plan, folder), Progress(f"trials, {command.task}", command.trials) as progress:
+        result = compare(plan, folder, command.reference, command.candidate, command.trials, progress.advance)
     print(f"{result.trials} trials on {result.objects} objects, {result.positives} positives in the reference")
     print(f"  label agreement   {result.label_agreement:.1%}")
     print(f"  F1 of positives   {result.positive_f1:.3f}")
@@ -175,10 +175,10 @@ def _fidelity(command: FidelitySettings) -> int:
 
 def _dynamics(command: DynamicsSettings) -> int:
     from cluster.benchmarks.dynamics import ALL, measure
-    from cluster.benchmarks.progress import progress
+    from shared.progress import Progress
 
-    with planned(command) as (plan, folder), progress(f"rollouts, {command.task}", command.rollouts) as advance:
-        found = measure(plan, folder, command.rollouts, command.draws, command.actions, advance)
+    with planned(command) as (plan, folder), Progress(f"rollouts, {command.task}", command.rollouts) as progress:
+        found = measure(plan, folder, command.rollouts, command.draws, command.actions, progress.advance)
     print(f"{'category':<18}{'trials':>7}{'success':>9}{'pairs':>7}{'ever':>6}{'depends on draw':>17}  outcomes")
     for name, figures in found.items():
         outcomes = ", ".join(f"{kind} {share:.0%}" for kind, share in figures.outcomes.items())
@@ -196,18 +196,18 @@ def _collect(command: CollectSettings) -> int:
         # Before SAPIEN and torch: where their libraries come first, Ray's start may abort in std::regex.
         import ray  # noqa: F401
     from cluster.benchmarks.collecting import CollectionBenchmark
-    from cluster.benchmarks.progress import progress
+    from shared.progress import Progress
 
     with planned(command) as (plan, folder):
         benchmark = CollectionBenchmark(plan, folder, command.rollouts, command.repeats, command.sample)
-        with progress(f"jobs and published trials, {command.task}", benchmark.steps) as advance:
-            benchmark.run(advance)
+        with Progress(f"jobs and published trials, {command.task}", benchmark.steps) as progress:
+            benchmark.run(progress.advance)
         result = benchmark.as_json()
         if command.workers > 1:
             from cluster.benchmarks.speedup import speedup
 
-            with progress(f"turns of 1 and {command.workers} workers", 2 * command.repeats + 2) as advance:
-                result |= speedup(plan, folder, command.rollouts, command.repeats, command.workers, advance)
+            with Progress(f"turns of 1 and {command.workers} workers", 2 * command.repeats + 2) as progress:
+                result |= speedup(plan, folder, command.rollouts, command.repeats, command.workers, progress.advance)
     _print_collect(result)
     return finish(command, "collect", result)
 

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 import tyro
 from pydantic import Field
 
-from cluster.benchmarks.progress import progress
-from cluster.cells import percent
 from cluster.commands.bench import check_picture, finish
 from cluster.commands.bench_learner import StoredSettings, source_of, stored
 from cluster.settings import parse_flags
+from shared.formatting import percent
+from shared.progress import Progress
 
 
 class HintsSettings(StoredSettings):
@@ -54,8 +54,8 @@ def hints(args: list[str]) -> int:
         print(f"--policy {unknown(command.policy)}", file=sys.stderr)
     with stored(command) as store:
         benchmark = HintBenchmark(store, policy, seen)
-        with progress("shards of hints", benchmark.turns) as advance:
-            benchmark.run(advance)
+        with Progress("shards of hints", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
         result = benchmark.as_json() | source_of(command, store) | {"policy": command.policy}
     _print(result)
     code = finish(command, "hints", result)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from pydantic import Field
 
-from cluster.benchmarks.progress import progress
 from cluster.commands.bench import BenchSettings, finish, planned
 from cluster.settings import parse_flags
+from shared.progress import Progress
 from shared.tasks import task_named
 
 if TYPE_CHECKING:
@@ -77,8 +77,8 @@ def learner(args: list[str]) -> int:
     with stored(command) as store:
         config = LearnerConfig(seed=command.seed)
         benchmark = LearningBenchmark(store, config, command.repeats, command.steps, command.port_interactions)
-        with progress("turns of training, and of the published step", benchmark.turns) as advance:
-            benchmark.run(advance)
+        with Progress("turns of training, and of the published step", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
         result = benchmark.as_json() | source_of(command, store)
     _print_learner(result)
     return finish(command, "learner", result)
@@ -94,8 +94,8 @@ def adapt(args: list[str]) -> int:
     with stored(command) as store:
         policy = Policy.untrained(store.setting.task, NetworkConfig(), command.seed)
         benchmark = AdaptationBenchmark(store, policy, command.repeats)
-        with progress("rollouts of test-time steps", benchmark.turns) as advance:
-            benchmark.run(advance)
+        with Progress("rollouts of test-time steps", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
         result = benchmark.as_json() | source_of(command, store)
     print(f"{result['steps']} steps at each size, {result['threads']} threads; medians in ms")
     print(f"  {'points':>7}{'propose':>9}{'update':>9}{'step':>9}{'known observation':>20}")
@@ -141,8 +141,8 @@ def stored(command: StoredSettings) -> Iterator["Store"]:
     with planned(command) as (plan, folder), TemporaryDirectory(prefix="adaafford-bench-") as scratch:
         store = Store.create(Path(scratch) / "store", plan.setting)
         worker, jobs = Worker(store.path, folder), missing_jobs(plan.key, command.rollouts, [], 4)
-        with progress(f"jobs of collection, {command.task}", len(jobs)) as advance:
+        with Progress(f"jobs of collection, {command.task}", len(jobs)) as progress:
             for job in jobs:
                 worker.run(plan, job)
-                advance()
+                progress.advance()
         yield store

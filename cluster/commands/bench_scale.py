@@ -10,11 +10,11 @@ from typing import Annotated, Any
 import tyro
 from pydantic import Field
 
-from cluster.benchmarks.progress import progress
 from cluster.commands.bench import check_picture, finish
 from cluster.commands.bench_learner import StoredSettings, source_of, stored
 from cluster.settings import parse_flags
 from shared.errors import UsageError
+from shared.progress import Progress
 
 
 class ScaleSettings(StoredSettings):
@@ -66,11 +66,11 @@ def scale(args: list[str]) -> int:
         fleets = scaling.FleetBenchmark(
             source.plans()[0], command.actors, command.processes, command.shards_per_s, command.seconds
         )
-        with progress("fleets of sleeping actors", fleets.turns) as advance:
-            fleets.run(advance)
+        with Progress("fleets of sleeping actors", fleets.turns) as progress:
+            fleets.run(progress.advance)
         listing = ListingBenchmark(source, Path(scratch) / "large", command.shards)
-        with progress("stores of made-up shards", listing.turns) as advance:
-            listing.run(advance)
+        with Progress("stores of made-up shards", listing.turns) as progress:
+            listing.run(progress.advance)
         rollout = source.setting.collection.rollout.interactions
     result |= {"fleets": [asdict(point) for point in fleets.points]}
     result |= {"stores": [asdict(point) for point in listing.points]}

@@ -6,10 +6,10 @@ from typing import Annotated
 import tyro
 from pydantic import Field
 
-from cluster.benchmarks.progress import progress
 from cluster.commands.bench import finish
 from cluster.commands.bench_learner import StoredSettings, source_of, stored
 from cluster.settings import parse_flags
+from shared.progress import Progress
 
 
 class StoreSettings(StoredSettings):
@@ -35,8 +35,8 @@ def store(args: list[str]) -> int:
 
     with stored(command) as source:
         benchmark = StoringBenchmark(source, command.repeats, command.bucket)
-        with progress("turns of writing and reading", benchmark.turns) as advance:
-            benchmark.run(advance)
+        with Progress("turns of writing and reading", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
         result = benchmark.as_json() | source_of(command, source)
     print(f"{result['interactions']} interactions in {result['shards']} shards, {command.repeats} times; medians")
     print(f"  bytes an interaction  {result['bytes_per_interaction']:.0f}")
