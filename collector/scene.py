@@ -13,6 +13,7 @@ from collector.engine import Assembly, Link, new_scene, physx, pose, sapien, set
 from collector.gripper import Gripper, add_gripper
 from collector.jointed_gripper import add_jointed_gripper
 from shared.configuration import Fidelity, Timing
+from shared.hidden import HIDDEN_PARAMETERS
 from shared.vocabulary import Direction, Float, HiddenDynamics, Primitive
 
 RESTITUTION = 0.01
@@ -59,7 +60,7 @@ class Scene:
 
     Args:
         target: the object.
-        dynamics: the hidden draw, applied to every movable part.
+        dynamics: the hidden draw, applied to every movable part by the records of its parameters.
         fidelity: time step, solver iterations, and how the hand flies.
         primitive: what will be executed.
 
@@ -76,23 +77,46 @@ class Scene:
         pushes = primitive is Primitive.PUSH
         iterations = fidelity.push_solver_iterations if pushes else fidelity.solver_iterations
         self._scene, self.system = new_scene(iterations)
-        material = physx.PhysxMaterial(dynamics.surface_friction, dynamics.surface_friction, RESTITUTION)
-        self._articulation, self._links = _add_object(self._scene, target, material)
+        self._material = physx.PhysxMaterial(0.0, 0.0, RESTITUTION)
+        self._articulation, self._links = _add_object(self._scene, target, self._material)
         joints = {joint.name: joint for joint in self._articulation.active_joints}
         self._joints = [joints[_joint_name(k)] for k in range(1, len(self._links))]
         names = [joint.name for joint in self._articulation.active_joints]
         self._order = np.array([names.index(joint.name) for joint in self._joints], dtype=np.int64)
         self._bodies = {link: k for k, link in enumerate(self._links)}
-        for link, joint in zip(self._links[1:], self._joints, strict=True):
-            set_mass(link, dynamics.part_mass)
-            joint.set_drive_property(0.0, FRICTION_DAMPING, force_limit=dynamics.joint_friction)
+        for name, value in dynamics.values.items():
+            HIDDEN_PARAMETERS.get(name).apply(self, value)
         add_hand = add_jointed_gripper if fidelity.jointed_hand else add_gripper
-        self.gripper: Gripper = add_hand(self._scene, material)
+        self.gripper: Gripper = add_hand(self._scene, self._material)
         self._hand = {self.gripper.palm, *self.gripper.fingers}
         self._fidelity = fidelity
         self._impulse_squared = 0.0
         self.limits = target.limits()
         self.park()
+
+    @property
+    def links(self) -> list[Link]:
+        """SAPIEN's links of the movable parts, in part order."""
+        return self._links[1:]
+
+    @property
+    def joints(self) -> list[physx.PhysxArticulationJoint]:
+        """SAPIEN's joints of the movable parts, in part order."""
+        return self._joints
+
+    def set_part_mass(self, mass: float) -> None:
+        """Give every movable part this mass, kg; its inertia is scaled along."""
+        for link in self.links:
+            set_mass(link, mass)
+
+    def set_joint_friction(self, limit: float) -> None:
+        """Give every movable joint this Coulomb friction: N m if it turns, N if it slides."""
+        for joint in self.joints:
+            joint.set_drive_property(0.0, FRICTION_DAMPING, force_limit=limit)
+
+    def set_surface_friction(self, coefficient: float) -> None:
+        """Give the surfaces of hand and object this friction coefficient, static and dynamic."""
+        self._material.static_friction = self._material.dynamic_friction = coefficient
 
     def set_timing(self, timing: Timing) -> None:
         """Step time, and move the hand, as `timing` says from now on."""
