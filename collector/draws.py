@@ -10,7 +10,7 @@ import numpy as np
 
 from shared import seeds
 from shared.configuration import DynamicsRanges, Range
-from shared.hidden import BUILT_IN
+from shared.hidden import ALWAYS_DRAWN
 from shared.plan import ObjectRef, Plan
 from shared.tasks import Task, task_named
 from shared.vocabulary import HiddenDynamics
@@ -56,8 +56,8 @@ def object_of(plan: Plan, index: int) -> ObjectRef:
 
 
 def draw_dynamics(ranges: DynamicsRanges, task: Task, rng: np.random.Generator) -> HiddenDynamics:
-    """Our hidden parameters within `ranges`, with one of the task's direction modes."""
-    values = {name: draw_range(ranges[name], rng) for name in BUILT_IN}
+    """The hidden parameters that are always drawn, within `ranges`, with one of the task's direction modes."""
+    values = {name: draw_range(ranges[name], rng) for name in ALWAYS_DRAWN}
     return HiddenDynamics(values, task.directions[int(rng.integers(len(task.directions)))])
 
 

@@ -14,19 +14,19 @@ import torch
 from torch import Tensor
 
 from shared.configuration import DynamicsRanges, Range
-from shared.hidden import BUILT_IN
+from shared.hidden import ALWAYS_DRAWN
 from shared.vocabulary import Float
 
 WAY_WIDTH = 7
 WAYS_WIDTH = 2 * WAY_WIDTH
-FACTS_WIDTH = len(BUILT_IN) + WAYS_WIDTH
-"""Where there are no hidden parameters but ours; each further one adds a number."""
+FACTS_WIDTH = len(ALWAYS_DRAWN) + WAYS_WIDTH
+"""Where no other hidden parameters are drawn than always; each further one adds a number."""
 _TOLD_AS: dict[str, Callable[[Float], Float]] = {
     "part_mass": lambda values: np.log(np.maximum(values, 1e-6)),
     "joint_friction": lambda values: values,
     "surface_friction": lambda values: np.log(np.maximum(values, 1e-6)),
 }
-"""How oracles were told ours from the beginning; others are told as a place in their range."""
+"""How oracles were told these from the beginning; others are told as a place in their range."""
 MIN_ROOM = 0.01
 """A part that has less room, rad or length, cannot move that way: no such motion would count as a success."""
 MIN_TURNING = 0.1
@@ -59,15 +59,15 @@ class HiddenColumns:
 def facts_of(hidden: HiddenColumns) -> Float:
     """Facts for the oracle, [I, FACTS_WIDTH or more], in the view frame.
 
-    Columns: a number for each hidden parameter, ours first; for each of the two ways in which the part might move, the
-    room that it has and its twist (w, v), zero where there is no room. A joint's sign is a convention of its file, so
-    that the ways come in an order of their own (`ordered_ways`).
+    Columns: a number for each hidden parameter, first those that are always drawn; for each of the two ways in which
+    the part might move, the room that it has and its twist (w, v), zero where there is no room. A joint's sign is a
+    convention of its file, so that the ways come in an order of their own (`ordered_ways`).
     """
     turned = np.einsum("iab,icb->ica", hidden.view, hidden.twist.reshape(-1, 2, 3))
     # w x p + v is the same motion, whatever point p and v are taken from.
     turned[:, 1] += np.cross(turned[:, 0], hidden.middle)
     turned = turned.reshape(-1, 6)
-    told = [_TOLD_AS[name](hidden.dynamics[name]) for name in BUILT_IN]
+    told = [_TOLD_AS[name](hidden.dynamics[name]) for name in ALWAYS_DRAWN]
     told += [_place(hidden.dynamics[name], hidden.ranges[name]) for name in hidden.ranges.added]
     room = np.clip(np.nan_to_num(hidden.room, nan=0.0, posinf=MAX_ROOM), 0.0, MAX_ROOM)[..., None]
     both = np.stack([turned, -turned], axis=1) * (room > MIN_ROOM)

@@ -95,7 +95,7 @@ def read_oracle(path: Path, config: NetworkConfig) -> OracleCritic:
 
 
 def _facts_told(data: bytes, source: str) -> int:
-    """How many facts an oracle of hostile bytes was told; ours where they do not say, since it is refused later."""
+    """How many facts an oracle of hostile bytes was told; where they do not say, it is refused later."""
     match tensor_header(data, source).get("oracle.first.first.weight"):
         case {"shape": [_, int(facts)]} if 0 < facts <= MAX_FACTS:
             return facts

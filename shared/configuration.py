@@ -11,7 +11,7 @@ from shared.documents import MAX_PROBLEMS, MAX_WORD, printable
 from shared.errors import UsageError
 from shared.extensions import Registry
 from shared.files import read_named
-from shared.hidden import BUILT_IN, HIDDEN_PARAMETERS, NAME, HiddenParameter
+from shared.hidden import ALWAYS_DRAWN, HIDDEN_PARAMETERS, NAME, HiddenParameter
 from shared.vocabulary import Order, Primitive
 
 MAX_CONFIGURATION_BYTES = 1 << 18
@@ -151,21 +151,21 @@ FIDELITIES = {
 class DynamicsRanges(RootModel[dict[Annotated[str, Field(pattern=NAME)], Range]]):
     """What hidden parameters are drawn from, by their names (see `shared.hidden`).
 
-    Ours are always among them; those of other packages where they are named. An empty table, or none for ours, gives
-    the range that the parameter's own record proposes.
+    Those that are always drawn are always among them; others where they are named. An empty table, or none for the
+    former, gives the range that the parameter's own record proposes.
     """
 
     model_config = ConfigDict(frozen=True)
     root: dict[Annotated[str, Field(pattern=NAME)], Range] = Field(
-        default_factory=lambda: {name: _proposed(parameter) for name, parameter in BUILT_IN.items()}
+        default_factory=lambda: {name: _proposed(parameter) for name, parameter in ALWAYS_DRAWN.items()}
     )
 
     @model_validator(mode="before")
     @classmethod
-    def _with_ours(cls, given: Any) -> Any:
+    def _with_proposed(cls, given: Any) -> Any:
         if not isinstance(given, dict):
             return given
-        names = [*BUILT_IN, *sorted(given.keys() - BUILT_IN.keys())]
+        names = [*ALWAYS_DRAWN, *sorted(given.keys() - ALWAYS_DRAWN.keys())]
         ranges = {name: given.get(name, {}) for name in names}
         return {n: _proposed(HIDDEN_PARAMETERS.get(n)) if value == {} else value for n, value in ranges.items()}
 
@@ -175,12 +175,12 @@ class DynamicsRanges(RootModel[dict[Annotated[str, Field(pattern=NAME)], Range]]
 
     @property
     def added(self) -> tuple[str, ...]:
-        """The parameters that are not ours, in order of name."""
-        return tuple(sorted(self.root.keys() - BUILT_IN.keys()))
+        """The parameters that not every store has, in order of name."""
+        return tuple(sorted(self.root.keys() - ALWAYS_DRAWN.keys()))
 
     @property
     def extensions(self) -> list[tuple[Registry[Any], str]]:
-        """What of it other packages add: registry and name."""
+        """What of it packages may add: registry and name."""
         return [(HIDDEN_PARAMETERS, name) for name in self.added]
 
     def check_known(self) -> None:
@@ -227,8 +227,8 @@ class CollectionConfig(StrictModel):
     collision: Collision = "hulls"
     """What objects collide as: each mesh's convex hull, which closes cavities, or its convex decomposition."""
     dynamics: DynamicsRanges | None = None
-    """What hidden parameters are drawn from, instead of the task's own ranges; those of other packages are drawn where
-    they are named here."""
+    """What hidden parameters are drawn from, instead of the ranges of the task. Those of packages are drawn if they
+    are named here."""
     rollout: RolloutConfig = RolloutConfig()
 
 

@@ -2,7 +2,7 @@
 
 Each is declared in one record. Drawing, settings, columns of the store, facts for the oracle, and the words and tables
 of the report follow from it. A package adds one by an entry point of the group `adaafford.hidden_parameters`
-(docs/extending.md); it is active in settings that name it in `collection.dynamics`.
+(docs/extending.md). All but the first three are active only in settings that name them in `collection.dynamics`.
 """
 
 import re
@@ -56,8 +56,8 @@ class HiddenParameter:
         high: likewise.
         log: whether the logarithm is uniform instead of the value.
         apply: puts a value into force on a simulated object; called once a rollout.
-        default: what held where stores lack it: what the simulator does where it is not applied. None for ours, which
-            every store has.
+        default: what held where stores lack it: what the simulator does where it is not applied. None: every store has
+            it, which only the first three can say.
     """
 
     name: str
@@ -114,7 +114,8 @@ BUILT_IN = {
         ),
     )
 }
-"""In the order in which they are drawn and told to the oracle."""
+ALWAYS_DRAWN = {name: parameter for name, parameter in BUILT_IN.items() if parameter.default is None}
+"""Those that every setting draws and every store has, in the order in which they are drawn and told to the oracle."""
 
 HIDDEN_PARAMETERS = Registry("hidden parameter", HiddenParameter, BUILT_IN)
 

@@ -22,7 +22,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.hidden import BUILT_IN
+from shared.hidden import ALWAYS_DRAWN
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -132,8 +132,8 @@ class HiddenDynamics:
 
     @property
     def added(self) -> tuple[str, ...]:
-        """The parameters that are not ours, in order of name."""
-        return tuple(sorted(self.values.keys() - BUILT_IN.keys()))
+        """The parameters that not every store has, in order of name."""
+        return tuple(sorted(self.values.keys() - ALWAYS_DRAWN.keys()))
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from learner.stages import StageJob, run_stage
 from shared.configuration import FIDELITIES, DynamicsRanges, Range
 from shared.errors import StoreError, UsageError
 from shared.geometry import gripper_rotation
-from shared.hidden import BUILT_IN, HIDDEN_PARAMETERS, HiddenParameter
+from shared.hidden import ALWAYS_DRAWN, HIDDEN_PARAMETERS, HiddenParameter
 from shared.plan import Job, Plan
 from shared.store import Store, compact, export, merge, repair, verify
 from shared.store.columns import ROLLOUT_COLUMNS, added_column
@@ -147,7 +147,7 @@ def test_it_is_drawn_stored_and_digested_and_changes_no_draw_of_ours(stores: tup
     rates = table.column(COLUMN).to_numpy()
     assert len(set(rates)) == 4
     assert ((rates > 0) & (rates < 20)).all()
-    for name in (*BUILT_IN, "direction", "azimuth_deg", "object_id"):
+    for name in (*ALWAYS_DRAWN, "direction", "azimuth_deg", "object_id"):
         assert known.column(name).to_pylist() == table.column(name).to_pylist(), name
     assert plain.digest() != damped.digest()
     assert verify(plain) == verify(damped) == []
@@ -170,7 +170,7 @@ def test_the_oracle_is_told_where_it_lies_in_its_range(stores: tuple[Path, Path]
     ours, known = (load_dataset(Store.open(path), TINY) for path in stores)
     assert ours.rows.facts.shape[1] == FACTS_WIDTH
     assert known.rows.facts.shape[1] == FACTS_WIDTH + 1
-    told = known.rows.facts[:, len(BUILT_IN)].numpy()
+    told = known.rows.facts[:, len(ALWAYS_DRAWN)].numpy()
     rows = Store.open(stores[1]).interactions(["outcome", COLUMN]).to_pylist()
     np.testing.assert_allclose(told, [row[COLUMN] / 10.0 - 1.0 for row in rows], rtol=1e-5)
     prior = run_stage(StageJob("prior", stores[1], tmp_path / "prior"), TRAINING)
@@ -264,7 +264,7 @@ def test_a_flag_names_it_with_or_without_a_range(word: str, found: Range, instal
     assert ranges is not None
     assert ranges[NAME] == found
     assert ranges["joint_friction"] == DynamicsRanges()["joint_friction"]
-    assert list(ranges.root) == [*BUILT_IN, NAME]
+    assert list(ranges.root) == [*ALWAYS_DRAWN, NAME]
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from learner.sampling import Batch, order_rows
 from shared.configuration import DynamicsRanges
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
-from shared.hidden import BUILT_IN
+from shared.hidden import ALWAYS_DRAWN
 from shared.networks.actions import middle_of, orthonormal_frames
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
@@ -154,7 +154,7 @@ def hidden_of(axis: np.ndarray, through: np.ndarray, room: tuple[float, float] =
     return HiddenColumns(
         twist=np.concatenate([axis, np.cross(through, axis)])[None],
         room=np.array([room]),
-        dynamics={name: np.ones(1) for name in BUILT_IN},
+        dynamics={name: np.ones(1) for name in ALWAYS_DRAWN},
         ranges=DynamicsRanges(),
         view=np.eye(3)[None],
         middle=np.zeros((1, 3)),

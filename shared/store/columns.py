@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from shared.hidden import BUILT_IN, NAME, hidden_parameter
+from shared.hidden import ALWAYS_DRAWN, NAME, hidden_parameter
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.vocabulary import Direction, Float, Order, OutcomeKind, Primitive, Role
 
@@ -26,7 +26,7 @@ MAX_TEXT = 200
 """Characters of a cell, unless its column says otherwise."""
 MAX_JOINT_NAMES = 1 << 16
 HIDDEN_PREFIX = "hidden_"
-"""The column of a hidden parameter that is not ours is called by its name after this; no other column begins so."""
+"""Before the name of a hidden parameter that not every store has; no other column begins so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,17 +145,17 @@ def _hidden_column(name: str, column: str, *, content: bool = True) -> Column[An
 
 @lru_cache(maxsize=1024)
 def added_column(name: str, *, content: bool) -> Column[Any]:
-    """The column of a hidden parameter that is not ours: content of rollouts.parquet, and a copy in the other table."""
+    """The column of a parameter that not every store has: content of rollouts.parquet, a copy in the other table."""
     return _hidden_column(name, HIDDEN_PREFIX + name, content=content)
 
 
 def hidden_names(added: Sequence[str]) -> dict[str, str]:
-    """The columns of hidden parameters by the parameters' names: ours, then some others."""
-    return {name: name for name in BUILT_IN} | {name: HIDDEN_PREFIX + name for name in added}
+    """The columns of hidden parameters by the parameters' names: those that every store has, then some others."""
+    return {name: name for name in ALWAYS_DRAWN} | {name: HIDDEN_PREFIX + name for name in added}
 
 
 def rollout_columns(added: Sequence[str]) -> tuple["Column[RolloutRow]", ...]:
-    """The columns of rollouts.parquet in a store with some hidden parameters that are not ours."""
+    """The columns of rollouts.parquet in a store with some hidden parameters that not every store has."""
     return (*ROLLOUT_COLUMNS, *(added_column(name, content=True) for name in added))
 
 
@@ -165,7 +165,7 @@ def interaction_columns(added: Sequence[str]) -> tuple["Column[InteractionRow]",
 
 
 def added_in(columns: Sequence[str]) -> tuple[str, ...]:
-    """The hidden parameters that are not ours, by the names of a table's columns."""
+    """The hidden parameters that not every store has, by the names of a table's columns."""
     names = (column.removeprefix(HIDDEN_PREFIX) for column in columns if column.startswith(HIDDEN_PREFIX))
     return tuple(sorted(name for name in names if re.fullmatch(NAME, name)))
 
@@ -178,7 +178,7 @@ def _rollout_columns() -> tuple[Column[RolloutRow], ...]:
         Column("object_id", "", 0, "object", lambda x: r(x).object.id),
         Column("object_category", "", 0, "its category", lambda x: r(x).object.category),
         Column("object_hash", "", 0, "SHA-256 of its files", lambda x: r(x).object.content_hash),
-        *(_hidden_column(name, name) for name in BUILT_IN),
+        *(_hidden_column(name, name) for name in ALWAYS_DRAWN),
         Column(
             "direction",
             "",

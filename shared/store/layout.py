@@ -32,7 +32,7 @@ from shared.store.sealed import is_sealed, unsealed
 SCHEMA_VERSION = 1
 """What the number promises, and when it grows, is told in docs/compatibility.md."""
 HIDDEN_VERSION = 2
-"""Of stores with hidden parameters that are not ours: software that knows version 1 alone computes another digest."""
+"""Of stores with further hidden parameters: software that knows version 1 alone would compute another digest."""
 STORE_FILE = "store.json"
 MANIFEST_FILE = "manifest.json"
 INTERACTIONS_FILE = "interactions.parquet"
@@ -66,7 +66,7 @@ _SHARD_ID = re.compile(rf"(?P<plan>{PLAN_KEY})-(?P<start>[0-9]{{8,12}})-(?P<stop
 
 
 def schema_version(added: Sequence[str]) -> int:
-    """The version of documents about rollouts with some hidden parameters that are not ours."""
+    """The version of documents about rollouts with some hidden parameters that not every store has."""
     return HIDDEN_VERSION if added else SCHEMA_VERSION
 
 

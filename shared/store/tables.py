@@ -1,7 +1,7 @@
 """Parquet: rows to bytes and hostile bytes to columns."""
 
 from collections.abc import Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -67,8 +67,8 @@ def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Seq
 
     Args:
         data: a Parquet file.
-        columns: what it must hold; what has a default may be missing. Hidden parameters that are not ours may come
-            beside them, whether their packages are installed here or not.
+        columns: what it must hold; what has a default may be missing. Further hidden parameters may come beside
+            them, whether their packages are installed here or not.
         rows: how many rows it must have.
         source: what messages call it.
         names: read these columns only.
@@ -116,7 +116,7 @@ def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Seq
 
 
 def with_added(columns: Columns, there: Sequence[str]) -> Columns:
-    """Columns, and those of the hidden parameters that are not ours among what is there."""
+    """Columns, and those of further hidden parameters among what is there."""
     return (*columns, *(added_column(name, content=False) for name in added_in(there)))
 
 
@@ -230,7 +230,7 @@ def _size_of_texts(cells: Any) -> int:
     return size
 
 
-@cache
+@lru_cache(maxsize=64)
 def _schema_when_read(columns: tuple[Column[Any], ...]) -> Any:
     texts = pa.dictionary(pa.int32(), pa.string())
     return pa.schema(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from shared.errors import StoreError
-from shared.hidden import BUILT_IN
+from shared.hidden import ALWAYS_DRAWN
 from shared.plan import Job
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store.columns import MAX_TEXT
@@ -63,7 +63,7 @@ def check_quarantined(rollouts: Sequence[RolloutRecord], quarantined: Sequence[Q
 
 def _check_rollout(rollout: RolloutRecord, points: int) -> None:
     _check_texts(rollout.fidelity, rollout.status, rollout.object.category)
-    if missing := BUILT_IN.keys() - rollout.dynamics.values.keys():
+    if missing := ALWAYS_DRAWN.keys() - rollout.dynamics.values.keys():
         raise ValueError(f"lacks the hidden parameter '{min(missing)}'")
     _check_finite("rollout's numbers", _rollout_numbers(rollout))
     for observation in rollout.observations:
