@@ -37,6 +37,7 @@ from shared.store.tables import read_table
 from shared.vocabulary import Action, HiddenDynamics, Primitive
 from tests.fabricate import fabricate_rollouts, fabricate_setting
 from tests.single_door import door, drawer
+from tests.test_compatibility import add_column, shards_of
 from tests.test_learner_training import FAST as TRAINING
 from tests.test_networks import TINY
 
@@ -237,6 +238,19 @@ def test_shards_of_another_setting_are_a_problem(tmp_path: Path) -> None:
     shutil.rmtree(store.shards_folder / shard)
     shutil.copytree(other.shards_folder / shard, store.shards_folder / shard)
     assert [problem.what for problem in verify(store)] == ["rollout 0 has other hidden parameters than the store's"]
+
+
+def test_the_copies_in_the_interactions_must_be_those_of_the_rollouts(tmp_path: Path) -> None:
+    store = fabricated(tmp_path / "store", {"wind": 1.0})
+    first, second = shards_of(store)
+    add_column(first, "interactions.parquet", pa.field("hidden_age", pa.float64(), nullable=False), [1.0, 1.0])
+    table = pq.read_table(second / "interactions.parquet").drop_columns(["hidden_wind"])
+    pq.write_table(table, second / "interactions.parquet", use_dictionary=False)
+    add_column(second, "interactions.parquet", pa.field("hidden_wind", pa.float64(), nullable=False), [1.0, 1.5])
+    assert [problem.what for problem in verify(store)] == [
+        "the interactions have columns of other hidden parameters than the rollouts",
+        "column hidden_wind does not agree with the columns that it restates",
+    ]
 
 
 @pytest.mark.parametrize("cells", [[1], ["a"], [float("nan")], [None]])

@@ -12,7 +12,7 @@ from shared.files import TEMPORARY_PREFIX
 from shared.plan import Job
 from shared.records import RolloutRecord
 from shared.store import reader
-from shared.store.columns import COPIED_COLUMNS, InteractionRow, added_in, interaction_columns
+from shared.store.columns import COPIED_COLUMNS, InteractionRow, added_in, hidden_names, interaction_columns
 from shared.store.coverage import Window, overlapping
 from shared.store.digest import rollout_digest
 from shared.store.layout import (
@@ -153,13 +153,13 @@ def _copies(shard: Folder, manifest: ShardManifest, rollouts: tuple[RolloutRecor
     rows = [InteractionRow(r, i, first) for r, first in zip(rollouts, firsts, strict=False) for i in r.interactions]
     table = reader.read_interactions(shard, manifest)
     added = rollouts[0].dynamics.added
+    if added_in(table.column_names) != added:
+        yield _problem(shard.key, "the interactions have columns of other hidden parameters than the rollouts")
+        return
+    restated = {*COPIED_COLUMNS, *hidden_names(added).values(), "observation", "point_camera", "rotation_camera"}
     for column in interaction_columns(added):
-        if column.name not in (*COPIED_COLUMNS, "observation", "point_camera", "rotation_camera"):
-            if not added_in([column.name]):
-                continue
-            if column.name not in table.column_names:
-                yield _problem(shard.key, f"column {column.name} is missing in the interactions")
-                continue
+        if column.name not in restated:
+            continue
         cells, kept = column.gather(rows), column_values(table, column)
         if column.dtype:
             agree = np.allclose(cells.numbers, np.ravel(kept), rtol=0.0, atol=_FRAME_TOLERANCE if column.width else 0.0)
