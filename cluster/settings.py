@@ -16,7 +16,7 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
-from shared.configuration import load_toml, merge, parse
+from shared.configuration import CollectionConfig, DynamicsRanges, load_toml, merge, parse
 from shared.errors import UsageError
 
 PRESETS_FOLDER = Path(__file__).parent / "presets"
@@ -52,6 +52,35 @@ def _list_with_commas(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] 
         return tuple(spec.instance_from_str(words))
 
     return replace(spec, instance_from_str=read, is_instance=lambda given: isinstance(given, tuple), choices=None)
+
+
+@FLAG_TYPES.primitive_rule
+def _ranges_by_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Let hidden parameters be named with or without a range: `joint_damping,part_mass=0.1:0.5:log`."""
+    if DynamicsRanges not in get_args(info.type):
+        return None
+
+    def read(args: list[str]) -> DynamicsRanges | None:
+        given = {"dynamics": dict(map(_named_range, args[0].split(",")))}
+        return parse(CollectionConfig, given, args[0][:80]).dynamics
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME[=LOW:HIGH[:log]],...",
+        instance_from_str=read,
+        is_instance=lambda given: given is None or isinstance(given, DynamicsRanges),
+        str_from_instance=lambda ranges: ["those of the task" if ranges is None else ", ".join(ranges.root)],
+    )
+
+
+def _named_range(word: str) -> tuple[str, dict[str, Any]]:
+    name, _, interval = word.partition("=")
+    match interval.split(":"):
+        case [""]:
+            return name, {}
+        case [low, high, *rest] if rest in ([], ["log"]):
+            return name, {"low": float(low), "high": float(high), "log": bool(rest)}
+    raise ValueError(f"{word[:80]!r} is no range; write NAME, NAME=LOW:HIGH or NAME=LOW:HIGH:log")
 
 
 def preset_names() -> list[str]:

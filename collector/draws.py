@@ -4,12 +4,13 @@ A rollout is a pure function of its plan and its number: object, hidden dynamics
 from seeds derived from these alone, so that it comes out the same whichever worker runs it, whenever.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from shared import seeds
 from shared.configuration import DynamicsRanges, Range
+from shared.hidden import ALWAYS_DRAWN
 from shared.plan import ObjectRef, Plan
 from shared.tasks import Task, task_named
 from shared.vocabulary import HiddenDynamics
@@ -29,8 +30,12 @@ class Draw:
 def draw_rollout(plan: Plan, index: int, attempt: int = 0) -> Draw:
     """The draw of rollout `index`; a further `attempt` draws another camera only."""
     setting, task = plan.setting, task_named(plan.setting.task)
-    rng = seeds.generator(setting.seed, f"dynamics/{plan.key}", index)
-    dynamics = draw_dynamics(setting.terms.dynamics, task, rng)
+    ranges = setting.dynamics
+    dynamics = draw_dynamics(ranges, task, seeds.generator(setting.seed, f"dynamics/{plan.key}", index))
+    for name in ranges.added:
+        # From a stream of its own, so that what else is drawn does not depend on it.
+        rng = seeds.generator(setting.seed, f"dynamics/{name}/{plan.key}", index)
+        dynamics = replace(dynamics, values={**dynamics.values, name: draw_range(ranges[name], rng)})
     camera = setting.collection.camera
     rng = seeds.generator(setting.seed, f"camera/{plan.key}", index, attempt)
     return Draw(
@@ -51,13 +56,9 @@ def object_of(plan: Plan, index: int) -> ObjectRef:
 
 
 def draw_dynamics(ranges: DynamicsRanges, task: Task, rng: np.random.Generator) -> HiddenDynamics:
-    """Hidden dynamics within `ranges`, with one of the task's direction modes."""
-    return HiddenDynamics(
-        part_mass=draw_range(ranges.part_mass, rng),
-        joint_friction=draw_range(ranges.joint_friction, rng),
-        surface_friction=draw_range(ranges.surface_friction, rng),
-        direction=task.directions[int(rng.integers(len(task.directions)))],
-    )
+    """The hidden parameters that are always drawn, within `ranges`, with one of the task's direction modes."""
+    values = {name: draw_range(ranges[name], rng) for name in ALWAYS_DRAWN}
+    return HiddenDynamics(values, task.directions[int(rng.integers(len(task.directions)))])
 
 
 def draw_range(interval: Range, rng: np.random.Generator) -> float:

@@ -40,9 +40,8 @@ class PublishedRequest(StrictModel):
 
     folder: Path
     """Of the object."""
-    part_mass: float
-    joint_friction: float
-    surface_friction: float
+    hidden: dict[str, float]
+    """Values of the hidden parameters."""
     direction: Direction
     joint_positions: tuple[float, ...]
     point: tuple[float, float, float]
@@ -110,7 +109,7 @@ def run(request: PublishedRequest) -> PublishedTiming:
     """
     started = time.process_time()
     fidelity = FIDELITIES["reference"]
-    dynamics = HiddenDynamics(request.part_mass, request.joint_friction, request.surface_friction, request.direction)
+    dynamics = HiddenDynamics(request.hidden, request.direction)
     primitive = PRIMITIVES.get(request.primitive)
     scene = Scene(read_object(request.folder), dynamics, fidelity, primitive)
     positions = np.array(request.joint_positions)

@@ -12,6 +12,7 @@ from collector.articulation import ArticulatedObject, Joint
 from collector.engine import Assembly, Link, new_scene, physx, pose, sapien, set_mass
 from collector.grippers import GRIPPERS
 from shared.configuration import PANDA, Fidelity, Timing
+from shared.hidden import HIDDEN_PARAMETERS
 from shared.primitives import PrimitiveSpec
 from shared.vocabulary import Direction, Float, HiddenDynamics
 
@@ -59,7 +60,7 @@ class Scene:
 
     Args:
         target: the object.
-        dynamics: the hidden draw, applied to every movable part.
+        dynamics: the hidden draw, applied to every movable part by the records of its parameters.
         fidelity: time step, solver iterations, and how the hand flies.
         primitive: what will be executed.
         gripper: the name of the hand.
@@ -81,22 +82,45 @@ class Scene:
         self.dynamics = dynamics
         iterations = fidelity.solver_iterations if primitive.needs_friction else fidelity.push_solver_iterations
         self._scene, self.system = new_scene(iterations)
-        material = physx.PhysxMaterial(dynamics.surface_friction, dynamics.surface_friction, RESTITUTION)
-        self._articulation, self._links = _add_object(self._scene, target, material)
+        self._material = physx.PhysxMaterial(0.0, 0.0, RESTITUTION)
+        self._articulation, self._links = _add_object(self._scene, target, self._material)
         joints = {joint.name: joint for joint in self._articulation.active_joints}
         self._joints = [joints[_joint_name(k)] for k in range(1, len(self._links))]
         names = [joint.name for joint in self._articulation.active_joints]
         self._order = np.array([names.index(joint.name) for joint in self._joints], dtype=np.int64)
         self._bodies = {link: k for k, link in enumerate(self._links)}
-        for link, joint in zip(self._links[1:], self._joints, strict=True):
-            set_mass(link, dynamics.part_mass)
-            joint.set_drive_property(0.0, FRICTION_DAMPING, force_limit=dynamics.joint_friction)
-        self.gripper = GRIPPERS.get(gripper).build(self._scene, material, fidelity.jointed_hand)
+        for name, value in dynamics.values.items():
+            HIDDEN_PARAMETERS.get(name).apply(self, value)
+        self.gripper = GRIPPERS.get(gripper).build(self._scene, self._material, fidelity.jointed_hand)
         self._hand = {self.gripper.palm, *self.gripper.fingers}
         self._fidelity = fidelity
         self._impulse_squared = 0.0
         self.limits = target.limits()
         self.park()
+
+    @property
+    def links(self) -> list[Link]:
+        """SAPIEN's links of the movable parts, in part order."""
+        return self._links[1:]
+
+    @property
+    def joints(self) -> list[physx.PhysxArticulationJoint]:
+        """SAPIEN's joints of the movable parts, in part order."""
+        return self._joints
+
+    def set_part_mass(self, mass: float) -> None:
+        """Give every movable part this mass, kg; its inertia is scaled along."""
+        for link in self.links:
+            set_mass(link, mass)
+
+    def set_joint_friction(self, limit: float) -> None:
+        """Give every movable joint this Coulomb friction: N m if it turns, N if it slides."""
+        for joint in self.joints:
+            joint.set_drive_property(0.0, FRICTION_DAMPING, force_limit=limit)
+
+    def set_surface_friction(self, coefficient: float) -> None:
+        """Give the surfaces of hand and object this friction coefficient, static and dynamic."""
+        self._material.static_friction = self._material.dynamic_friction = coefficient
 
     def set_timing(self, timing: Timing) -> None:
         """Step time, and move the hand, as `timing` says from now on."""

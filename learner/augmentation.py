@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from learner.configuration import AugmentationConfig
-from learner.facts import DYNAMICS_WIDTH, ordered_ways
+from learner.facts import WAY_WIDTH, WAYS_WIDTH, ordered_ways
 
 
 def draw_turns(count: int, config: AugmentationConfig, rng: np.random.Generator) -> Tensor:
@@ -33,9 +33,9 @@ def turn_vectors(turns: Tensor, vectors: Tensor) -> Tensor:
 
 
 def turn_facts(turns: Tensor, facts: Tensor) -> Tensor:
-    """Facts for the oracle, [B, n, FACTS_WIDTH], of what is seen after the turns (see `learner.facts`)."""
-    dynamics = facts[..., :DYNAMICS_WIDTH]
-    ways = facts[..., DYNAMICS_WIDTH:].reshape(*facts.shape[:2], 2, 7)
+    """Facts for the oracle, [B, n, facts], of what is seen after the turns (see `learner.facts`)."""
+    dynamics = facts[..., :-WAYS_WIDTH]
+    ways = facts[..., -WAYS_WIDTH:].reshape(*facts.shape[:2], 2, WAY_WIDTH)
     room, turning, sliding = ways[..., :1], ways[..., 1:4], ways[..., 4:]
     # An axis of rotation is the cross product of two vectors: a mirror turns it round beside reflecting it.
     handed = torch.linalg.det(turns)[:, None, None, None]

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from learner.facts import HiddenColumns, facts_of
 from learner.hardware import moved
+from shared.configuration import DynamicsRanges
 from shared.errors import StoreError, UsageError
 from shared.files import read_named
 from shared.geometry import view_from_world
@@ -23,13 +24,13 @@ from shared.grouping import Grouping, group_cloud
 from shared.networks.actions import middle_of
 from shared.networks.configuration import NetworkConfig
 from shared.networks.pointnet2 import CloudBatch
-from shared.store.columns import INTERACTION_COLUMNS
+from shared.store.columns import hidden_names, interaction_columns
 from shared.store.store import Store
 from shared.store.tables import column_values
-from shared.vocabulary import Float32, Order, OutcomeKind
+from shared.vocabulary import Float, Float32, Order, OutcomeKind
 
 COLUMNS = (
-    *("plan_key", "rollout", "object_id", "part_mass", "joint_friction", "surface_friction", "step"),
+    *("plan_key", "rollout", "object_id", "step"),
     *("point_index", "rotation", "order", "role", "policy_version", "method", "budget", "target_part"),
     *("joint_positions", "joint_limits", "joint_twist", "outcome", "motion", "success"),
 )
@@ -51,7 +52,7 @@ class Rows:
         success: r as 0 or 1, [I].
         step: [I], number within the rollout.
         continued: [I], whether the row began where the one before it left the object.
-        facts: [I, FACTS_WIDTH], for the oracle only.
+        facts: [I, facts], for the oracle only (see `learner.facts`).
         role, method: [I], names (see `shared.records.InteractionRecord`).
         budget: [I].
     """
@@ -120,22 +121,26 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
     Raises:
         StoreError: the store is damaged, or holds no label at all.
     """
-    table = store.interactions(COLUMNS)
-    known = {column.name: column for column in INTERACTION_COLUMNS}
-    cells = {name: column_values(table, known[name]) for name in (*COLUMNS, "observation")}
+    ranges = store.setting.dynamics
+    known = {column.name: column for column in interaction_columns(ranges.added)}
+    hidden = hidden_names(ranges.added)
+    names = (*COLUMNS, *hidden.values(), "observation")
+    table = store.interactions(names)
+    cells = {name: column_values(table, known[name]) for name in names}
     keep = np.flatnonzero([OutcomeKind(kind).is_label for kind in cells["outcome"]])
     if not len(keep):
         raise StoreError(f"{store.where}: holds no interaction to learn from; collect some first")
     cells = {name: _take(values, keep) for name, values in cells.items()}
     shards = _take(table.column("shard").to_pylist(), keep)
-    names = list(zip(shards, cells["observation"].tolist(), strict=True))
-    index = {name: number for number, name in enumerate(sorted(set(names)))}
+    seen = list(zip(shards, cells["observation"].tolist(), strict=True))
+    index = {name: number for number, name in enumerate(sorted(set(seen)))}
     points, movable, views = _read_clouds(store, list(index))
-    cloud = np.array([index[name] for name in names])
+    cloud = np.array([index[name] for name in seen])
     batch = CloudBatch.of(points, group_all(points, config))
     masks = torch.from_numpy(np.stack(movable))
     middles = middle_of(batch.points, masks)
-    rows = _rows(cells, cloud, batch.points, views, middles)
+    dynamics = {name: cells[column] for name, column in hidden.items()}
+    rows = _rows(cells, dynamics, ranges, cloud, batch.points, views, middles)
     rollouts = _group(cells)
     return Dataset(
         task=store.setting.task,
@@ -241,7 +246,13 @@ def _read_clouds(
 
 
 def _rows(
-    cells: dict[str, Any], cloud: NDArray[np.int64], points: Tensor, views: NDArray[np.float64], middles: Tensor
+    cells: dict[str, Any],
+    dynamics: dict[str, Float],
+    ranges: DynamicsRanges,
+    cloud: NDArray[np.int64],
+    points: Tensor,
+    views: NDArray[np.float64],
+    middles: Tensor,
 ) -> Rows:
     view = views[cloud]
     rotation = cells["rotation"].reshape(-1, 3, 3)
@@ -253,7 +264,8 @@ def _rows(
     hidden = HiddenColumns(
         twist=cells["joint_twist"].reshape(-1, 6),
         room=_room(cells),
-        dynamics=np.stack([cells[name] for name in ("part_mass", "joint_friction", "surface_friction")], axis=1),
+        dynamics=dynamics,
+        ranges=ranges,
         view=view,
         middle=middles.double().numpy()[cloud],
     )

@@ -6,17 +6,27 @@ q (w x p + v). It tells the side of a hinge and its sign.
 Shapes: I interactions.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from shared.configuration import DynamicsRanges, Range
+from shared.hidden import ALWAYS_DRAWN
 from shared.vocabulary import Float
 
-DYNAMICS_WIDTH = 3
 WAY_WIDTH = 7
-FACTS_WIDTH = DYNAMICS_WIDTH + 2 * WAY_WIDTH
+WAYS_WIDTH = 2 * WAY_WIDTH
+FACTS_WIDTH = len(ALWAYS_DRAWN) + WAYS_WIDTH
+"""Where no other hidden parameters are drawn than always; each further one adds a number."""
+_TOLD_AS: dict[str, Callable[[Float], Float]] = {
+    "part_mass": lambda values: np.log(np.maximum(values, 1e-6)),
+    "joint_friction": lambda values: values,
+    "surface_friction": lambda values: np.log(np.maximum(values, 1e-6)),
+}
+"""How oracles were told these from the beginning; others are told as a place in their range."""
 MIN_ROOM = 0.01
 """A part that has less room, rad or length, cannot move that way: no such motion would count as a success."""
 MIN_TURNING = 0.1
@@ -32,35 +42,45 @@ class HiddenColumns:
     Attributes:
         twist: [I, 6], (w, v) of the target joint, world frame.
         room: [I, 2], how far the target joint can go up and down from where it starts.
-        dynamics: [I, 3], part mass, joint friction, surface friction.
+        dynamics: [I] each, the values of the hidden parameters.
+        ranges: that they were drawn from.
         view: [I, 3, 3], view frame from world frame.
         middle: [I, 3], view frame, of what may be moved; actions are told their places from there.
     """
 
     twist: Float
     room: Float
-    dynamics: Float
+    dynamics: Mapping[str, Float]
+    ranges: DynamicsRanges
     view: Float
     middle: Float
 
 
 def facts_of(hidden: HiddenColumns) -> Float:
-    """Facts for the oracle, [I, FACTS_WIDTH], in the view frame.
+    """Facts for the oracle, [I, FACTS_WIDTH or more], in the view frame.
 
-    Columns: log mass, joint friction, log surface friction; for each of the two ways in which the part might move, the
-    room that it has and its twist (w, v), zero where there is no room. A joint's sign is a convention of its file, so
-    that the ways come in an order of their own (`ordered_ways`).
+    Columns: a number for each hidden parameter, first those that are always drawn; for each of the two ways in which
+    the part might move, the room that it has and its twist (w, v), zero where there is no room. A joint's sign is a
+    convention of its file, so that the ways come in an order of their own (`ordered_ways`).
     """
     turned = np.einsum("iab,icb->ica", hidden.view, hidden.twist.reshape(-1, 2, 3))
     # w x p + v is the same motion, whatever point p and v are taken from.
     turned[:, 1] += np.cross(turned[:, 0], hidden.middle)
     turned = turned.reshape(-1, 6)
-    mass, friction, surface = hidden.dynamics.T
-    numbers = np.stack([np.log(np.maximum(mass, 1e-6)), friction, np.log(np.maximum(surface, 1e-6))], axis=1)
+    told = [_TOLD_AS[name](hidden.dynamics[name]) for name in ALWAYS_DRAWN]
+    told += [_place(hidden.dynamics[name], hidden.ranges[name]) for name in hidden.ranges.added]
     room = np.clip(np.nan_to_num(hidden.room, nan=0.0, posinf=MAX_ROOM), 0.0, MAX_ROOM)[..., None]
     both = np.stack([turned, -turned], axis=1) * (room > MIN_ROOM)
     ways = ordered_ways(torch.from_numpy(np.concatenate([room, both], axis=2))).numpy()
-    return np.concatenate([numbers, ways.reshape(len(ways), -1)], axis=1)
+    return np.concatenate([np.stack(told, axis=1), ways.reshape(len(ways), -1)], axis=1)
+
+
+def _place(values: Float, interval: Range) -> Float:
+    """Where values lie in an interval that they were drawn from: -1 at its lower end, 1 at its upper end."""
+    low, high = interval.low, interval.high
+    if interval.log:
+        low, high, values = np.log(low), np.log(high), np.log(np.maximum(values, 1e-12))
+    return np.asarray(2.0 * (values - low) / max(high - low, 1e-12) - 1.0)
 
 
 def ordered_ways(ways: Tensor) -> Tensor:

@@ -12,10 +12,14 @@ from torch import Tensor, nn
 from learner.facts import FACTS_WIDTH
 from learner.features import FrozenFeatures
 from learner.sampling import Batch
+from shared.errors import UsageError
 from shared.files import read_bounded
 from shared.networks.aap import Aap, OracleEncoder
 from shared.networks.configuration import NetworkConfig
-from shared.policy import MAX_WEIGHTS_BYTES, read_tensors
+from shared.policy import MAX_WEIGHTS_BYTES, read_tensors, tensor_header
+
+MAX_FACTS = 1 << 10
+"""More are not believed of a file."""
 
 
 class OracleCritic(nn.Module):
@@ -26,10 +30,11 @@ class OracleCritic(nn.Module):
         oracle: h.
     """
 
-    def __init__(self, aap: Aap) -> None:
+    def __init__(self, aap: Aap, facts: int = FACTS_WIDTH) -> None:
         super().__init__()
         self.aap = aap
-        self.oracle = OracleEncoder(FACTS_WIDTH, aap.config)
+        self.facts = facts
+        self.oracle = OracleEncoder(facts, aap.config)
         for unused in (aap.outcome_encoder, aap.code_head, aap.attention_head, aap.affordance_network()):
             unused.requires_grad_(False)
         aap.empty_latent.requires_grad_(False)
@@ -55,9 +60,19 @@ class Teacher:
     @classmethod
     @torch.no_grad()
     def of(cls, oracle: OracleCritic, known: FrozenFeatures) -> "Teacher":
-        """Ask the oracle about everything."""
+        """Ask the oracle about everything.
+
+        Raises:
+            UsageError: it was trained on a store with other hidden parameters.
+        """
         oracle.eval().requires_grad_(False)
-        rows, features = known.dataset.rows, known.rows(oracle.aap.encoder)
+        rows = known.dataset.rows
+        if rows.facts.shape[1] != oracle.facts:
+            raise UsageError(
+                f"the oracle knows {oracle.facts} hidden facts of a row, the store tells {rows.facts.shape[1]}; train "
+                "AAP anew on a store with these hidden parameters"
+            )
+        features = known.rows(oracle.aap.encoder)
         latents = oracle.oracle(rows.facts)
         scores = torch.sigmoid(oracle.aap.action_logits(features, rows.xyz, rows.frame, latents))
         return cls(latents, scores)
@@ -66,11 +81,22 @@ class Teacher:
 def read_oracle(path: Path, config: NetworkConfig) -> OracleCritic:
     """The oracle that the training of AAP left in a file, trusting nothing.
 
+    How many facts it knows is told by the file alone: as many as there were hidden parameters in its store.
+
     Raises:
         StoreError: the file is damaged, foreign, or of networks of another size.
     """
+    data = read_bounded(path, MAX_WEIGHTS_BYTES)
     with torch.device("meta"):
-        oracle = OracleCritic(Aap(config))
-    tensors = read_tensors(read_bounded(path, MAX_WEIGHTS_BYTES), oracle.state_dict(), str(path))
+        oracle = OracleCritic(Aap(config), _facts_told(data, str(path)))
+    tensors = read_tensors(data, oracle.state_dict(), str(path))
     oracle.load_state_dict(tensors, assign=True)
     return oracle.eval().requires_grad_(False)
+
+
+def _facts_told(data: bytes, source: str) -> int:
+    """How many facts an oracle of hostile bytes was told; where they do not say, it is refused later."""
+    match tensor_header(data, source).get("oracle.first.first.weight"):
+        case {"shape": [_, int(facts)]} if 0 < facts <= MAX_FACTS:
+            return facts
+    return FACTS_WIDTH

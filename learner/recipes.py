@@ -178,7 +178,7 @@ class Recipe:
         # Drawn on the CPU, so that the first weights are the same whatever device trains them.
         with torch.random.fork_rng(devices=[]), torch.device("cpu"):
             torch.manual_seed(torch_seed(self.config.seed, "learner.oracle") % 2**32)
-            critic = OracleCritic(copy.deepcopy(self.policy.aap))
+            critic = OracleCritic(copy.deepcopy(self.policy.aap), self.dataset.rows.facts.shape[1])
         critic.to(self.runner.hardware.device)
         config = self.config.aap
         settings = config.model_copy(

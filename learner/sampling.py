@@ -107,7 +107,7 @@ class Batch:
         frame: approach and forward, [B, n, 6].
         motion: m, [B, n].
         success: r as 0 or 1, [B, n].
-        facts: [B, n, FACTS_WIDTH].
+        facts: [B, n, facts].
     """
 
     clouds: CloudBatch

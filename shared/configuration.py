@@ -5,11 +5,13 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError, model_validator
 
 from shared.documents import MAX_PROBLEMS
 from shared.errors import UsageError
+from shared.extensions import Registry
 from shared.files import read_named
+from shared.hidden import ALWAYS_DRAWN, HIDDEN_PARAMETERS, NAME, HiddenParameter
 from shared.plain import MAX_WORD, plain
 from shared.vocabulary import Order
 
@@ -45,6 +47,8 @@ def _as_document(value: Any) -> Any:
         return value.as_document()
     if isinstance(value, tuple) and value and isinstance(value[0], StrictModel):
         return [one.as_document() for one in value]
+    if isinstance(value, RootModel):
+        return _as_document(value.root)
     if isinstance(value, dict) and value and isinstance(next(iter(value.values())), StrictModel):
         return {name: one.as_document() for name, one in value.items()}
     return None
@@ -148,12 +152,54 @@ FIDELITIES = {
 }
 
 
-class DynamicsRanges(StrictModel):
-    """What hidden dynamics are drawn from (see `shared.vocabulary.HiddenDynamics` for units)."""
+class DynamicsRanges(RootModel[dict[Annotated[str, Field(pattern=NAME)], Range]]):
+    """What hidden parameters are drawn from, by their names (see `shared.hidden`).
 
-    part_mass: Range = Range(low=0.05, high=0.5, log=True)
-    joint_friction: Range = Range(low=0.05, high=2.0, log=True)
-    surface_friction: Range = Range(low=0.2, high=10.0, log=True)
+    Those that are always drawn are always among them; others where they are named. An empty table, or none for the
+    former, gives the range that the parameter's own record proposes.
+    """
+
+    model_config = ConfigDict(frozen=True)
+    root: dict[Annotated[str, Field(pattern=NAME)], Range] = Field(
+        default_factory=lambda: {name: _proposed(parameter) for name, parameter in ALWAYS_DRAWN.items()}
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_proposed(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        names = [*ALWAYS_DRAWN, *sorted(given.keys() - ALWAYS_DRAWN.keys())]
+        ranges = {name: given.get(name, {}) for name in names}
+        return {n: _proposed(HIDDEN_PARAMETERS.get(n)) if value == {} else value for n, value in ranges.items()}
+
+    def __getitem__(self, name: str) -> Range:
+        """The range of one parameter."""
+        return self.root[name]
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """The parameters that not every store has, in order of name."""
+        return tuple(sorted(self.root.keys() - ALWAYS_DRAWN.keys()))
+
+    @property
+    def extensions(self) -> list[tuple[Registry[Any], str]]:
+        """What of it packages may add: registry and name."""
+        return [(HIDDEN_PARAMETERS, name) for name in self.added]
+
+    def check_known(self) -> None:
+        """See that the packages of all parameters are installed, before anything is drawn.
+
+        Raises:
+            UsageError: one is not.
+        """
+        for name in self.root:
+            HIDDEN_PARAMETERS.get(name)
+
+
+def _proposed(parameter: HiddenParameter) -> Range:
+    """The range that a parameter's own record proposes."""
+    return Range(low=parameter.low, high=parameter.high, log=parameter.log)
 
 
 class RolloutConfig(StrictModel):
@@ -189,7 +235,8 @@ class CollectionConfig(StrictModel):
     collision: Collision = "hulls"
     """What objects collide as: each mesh's convex hull, which closes cavities, or its convex decomposition."""
     dynamics: DynamicsRanges | None = None
-    """Instead of the task's own ranges."""
+    """What hidden parameters are drawn from, instead of the ranges of the task. Those of packages are drawn if they
+    are named here."""
     rollout: RolloutConfig = RolloutConfig()
 
 

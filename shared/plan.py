@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import FailFast, Field
 
-from shared.configuration import CollectionConfig, StrictModel
+from shared.configuration import CollectionConfig, DynamicsRanges, StrictModel
 from shared.methods import MethodName
 from shared.tasks import Terms, task_named
 
@@ -66,6 +66,11 @@ class Setting(StrictModel):
     def identities(self) -> frozenset[tuple[str, str, str]]:
         """Of all objects."""
         return frozenset(ref.identity for ref in self.objects)
+
+    @property
+    def dynamics(self) -> DynamicsRanges:
+        """What hidden parameters are drawn from; the task is looked up only where the setting leaves it to it."""
+        return self.collection.dynamics or self.terms.dynamics
 
     @property
     def terms(self) -> Terms:

@@ -59,8 +59,13 @@ class Task:
         )
 
     def resolve(self, collection: CollectionConfig) -> CollectionConfig:
-        """`collection` with what it leaves to the task filled in, so that a store says all that was decided."""
+        """`collection` with what it leaves to the task filled in, so that a store says all that was decided.
+
+        Raises:
+            UsageError: a hidden parameter is named whose package is not installed.
+        """
         terms = self.terms(collection)
+        terms.dynamics.check_known()
         return collection.model_copy(
             update={
                 "primitive": terms.primitive,

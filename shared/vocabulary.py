@@ -14,13 +14,15 @@ networks see this frame.
 Shapes: N points of a cloud.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from shared.hidden import ALWAYS_DRAWN
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -86,17 +88,36 @@ class Role(StrEnum):
     """What it chooses where the tries began, so that methods can be compared on one state (start-success)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class HiddenDynamics:
-    """What cannot be seen, drawn once a rollout and applied to every movable part alike."""
+    """What cannot be seen, drawn once a rollout and applied to every movable part alike.
 
-    part_mass: float
-    """Mass of a movable part, kg; its inertia is scaled along."""
-    joint_friction: float
-    """Coulomb friction of a movable joint: N m if it turns, N if it slides."""
-    surface_friction: float
-    """Friction coefficient between hand and object."""
-    direction: Direction = Direction.AS_BUILT
+    Example:
+        dynamics = HiddenDynamics(part_mass=0.2, joint_friction=0.05, surface_friction=1.0)
+        dynamics["part_mass"]
+
+    Attributes:
+        values: numbers by the names of their parameters (see `shared.hidden`).
+        direction: which ways joints turn.
+    """
+
+    values: Mapping[str, float]
+    direction: Direction
+
+    def __init__(
+        self, values: Mapping[str, float] | None = None, direction: Direction = Direction.AS_BUILT, **named: float
+    ) -> None:
+        object.__setattr__(self, "values", {**(values or {}), **named})
+        object.__setattr__(self, "direction", direction)
+
+    def __getitem__(self, name: str) -> float:
+        """The number of one parameter."""
+        return self.values[name]
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """The parameters that not every store has, in order of name."""
+        return tuple(sorted(self.values.keys() - ALWAYS_DRAWN.keys()))
 
 
 @dataclass(frozen=True, slots=True)

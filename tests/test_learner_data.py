@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from learner.augmentation import draw_turns, turn_facts
 from learner.configuration import AugmentationConfig
 from learner.data import Dataset, load_dataset, split
-from learner.facts import DYNAMICS_WIDTH, WAY_WIDTH, HiddenColumns, facts_of
+from learner.facts import WAY_WIDTH, WAYS_WIDTH, HiddenColumns, facts_of
 from learner.losses import (
     action_scoring_loss,
     distillation_loss,
@@ -23,8 +23,10 @@ from learner.losses import (
 )
 from learner.metrics import area_under_roc, best_f_score, calibration_error, discrimination, f_score
 from learner.sampling import Batch, order_rows
+from shared.configuration import DynamicsRanges
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
+from shared.hidden import ALWAYS_DRAWN
 from shared.networks.actions import middle_of, orthonormal_frames
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
@@ -152,7 +154,8 @@ def hidden_of(axis: np.ndarray, through: np.ndarray, room: tuple[float, float] =
     return HiddenColumns(
         twist=np.concatenate([axis, np.cross(through, axis)])[None],
         room=np.array([room]),
-        dynamics=np.ones((1, 3)),
+        dynamics={name: np.ones(1) for name in ALWAYS_DRAWN},
+        ranges=DynamicsRanges(),
         view=np.eye(3)[None],
         middle=np.zeros((1, 3)),
     )
@@ -160,7 +163,7 @@ def hidden_of(axis: np.ndarray, through: np.ndarray, room: tuple[float, float] =
 
 def ways_of(hidden: HiddenColumns) -> np.ndarray:
     """Room and twist of both ways, [2, WAY_WIDTH]."""
-    return facts_of(hidden)[0, DYNAMICS_WIDTH:].reshape(2, WAY_WIDTH)
+    return facts_of(hidden)[0, -WAYS_WIDTH:].reshape(2, WAY_WIDTH)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -20,7 +20,15 @@ from tests.single_door import door, drawer
 
 FAST = FIDELITIES["fast"]
 PUSH, PULL = PRIMITIVES.get("push"), PRIMITIVES.get("pull")
-EASY = HiddenDynamics(part_mass=0.2, joint_friction=0.05, surface_friction=1.0)
+
+
+def dynamics_of(
+    mass: float, friction: float, surface: float, direction: Direction = Direction.AS_BUILT
+) -> HiddenDynamics:
+    return HiddenDynamics({"part_mass": mass, "joint_friction": friction, "surface_friction": surface}, direction)
+
+
+EASY = dynamics_of(0.2, 0.05, 1.0)
 INTO = np.array([1.0, 0.0, 0.0])
 
 
@@ -68,7 +76,7 @@ def move_under(
     speed: float = 0.0,
 ) -> np.ndarray:
     """Joint position after each step under a constant effort (N or N m) on the joint, from rest or from a speed."""
-    scene = Scene(target, HiddenDynamics(mass, friction, 1.0), FAST, PUSH)
+    scene = Scene(target, dynamics_of(mass, friction, 1.0), FAST, PUSH)
     scene.put(np.zeros(1))
     scene._articulation.set_qvel(np.array([speed], dtype=np.float32))
     positions = []
@@ -114,7 +122,7 @@ def test_a_push_moves_a_free_drawer_as_far_as_the_hand_goes_and_friction_lets_it
     # The fingertips, 0.112 ahead of the hand, end 0.012 beyond p. The drawer comes off them at the hand's speed, and
     # slides until friction has taken its energy.
     speed = 0.05 / PUBLISHED_LEG_S * FAST.approach.pace
-    slide = 0.5 * EASY.part_mass * speed**2 / EASY.joint_friction
+    slide = 0.5 * EASY["part_mass"] * speed**2 / EASY["joint_friction"]
     assert outcome.motion == pytest.approx(0.012 + slide, abs=1e-3)
     assert outcome.displacement == pytest.approx([outcome.motion, 0.0, 0.0], abs=1e-4)
 
@@ -172,7 +180,7 @@ def test_less_surface_friction_makes_a_sideways_push_slip() -> None:
             drawer(),
             (0.2, 0.194, 0.0),
             PRIMITIVES.get("push-left"),
-            HiddenDynamics(0.2, 1.0, friction),
+            dynamics_of(0.2, 1.0, friction),
             approach=np.array([0.0, -1.0, 0.0]),
             forward=(1.0, 0.0, 0.0),
         )
@@ -190,7 +198,7 @@ def test_less_surface_friction_makes_a_slanted_push_slip() -> None:
         act(
             drawer(),
             (0.2, 0.0, 0.195),
-            dynamics=HiddenDynamics(0.2, 1.5, friction),
+            dynamics=dynamics_of(0.2, 1.5, friction),
             approach=np.array([1.0, 0.0, -1.0]) / np.sqrt(2),
             forward=(1.0, 0.0, 1.0),
         )
@@ -265,7 +273,7 @@ def test_gravity_pulls_and_a_part_that_falls_is_not_settled() -> None:
     part = type(body)(body.link, body.part_name, upright, body.visuals, body.collisions)
     scene = Scene(
         ArticulatedObject(falling.ref, (falling.bodies[0], part)),
-        HiddenDynamics(0.2, 0.01, 1.0),
+        dynamics_of(0.2, 0.01, 1.0),
         FAST,
         PULL,
     )
@@ -291,7 +299,7 @@ def test_direction_modes_bound_the_joint_on_the_hidden_side() -> None:
 
 def test_a_drawer_that_may_only_come_out_cannot_be_pushed_in() -> None:
     for direction, moves in ((Direction.CLOCKWISE, True), (Direction.COUNTER_CLOCKWISE, False)):
-        scene = Scene(drawer(), HiddenDynamics(0.2, 0.05, 1.0, direction), FAST, PULL)
+        scene = Scene(drawer(), dynamics_of(0.2, 0.05, 1.0, direction), FAST, PULL)
         scene.put(np.zeros(1))
         scene.restrict(np.zeros(1))
         action = Action(0, np.zeros(3), gripper_rotation(INTO, np.array([0.0, 0.0, 1.0])))

@@ -94,7 +94,7 @@ def test_any_numbers_and_texts_survive(tmp_path_factory: pytest.TempPathFactory,
                 seconds=data.draw(FINITE),
             )
         )
-    dynamics = dataclasses.replace(base.dynamics, part_mass=data.draw(FINITE))
+    dynamics = HiddenDynamics(base.dynamics.values, base.dynamics.direction, part_mass=data.draw(FINITE))
     rollout = dataclasses.replace(base, dynamics=dynamics, interactions=tuple(tries))
     store = Store.create(tmp_path_factory.mktemp("store"), SETTING)
     manifest = store.commit(PLAN, Job(PLAN.key, 0, 1), [rollout], {})
@@ -130,6 +130,9 @@ def mutations(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         for path, other in mutations(value[-1], f"{name}[-1]"):
             yield path, (*value[:-1], other)
         yield f"{name} (shorter)", value[:-1]
+    elif isinstance(value, dict):
+        for key, number in value.items():
+            yield f"{name}[{key}]", {**value, key: number + 1}
     elif isinstance(value, np.ndarray):
         other = value.copy()
         other.flat[-1] = other.flat[-1] == 0 if value.dtype == np.bool_ else np.nan_to_num(other.flat[-1]) + 1
@@ -179,7 +182,7 @@ def test_the_digest_of_a_known_rollout_stays_the_same() -> None:
         joint_twist=np.zeros(6),
         hand_start=np.zeros(7),
     )
-    dynamics = HiddenDynamics(0.5, 0.25, 1.0)
+    dynamics = HiddenDynamics(part_mass=0.5, joint_friction=0.25, surface_friction=1.0)
     known = dataclasses.replace(
         rollout, dynamics=dynamics, azimuth_deg=180.0, elevation_deg=45.0, observations=(cloud,), interactions=(one,)
     )

@@ -162,9 +162,7 @@ class CollectionBenchmark:
         own = self.folder / rollout.object.id
         request = PublishedRequest(
             folder=self.folder if urdf_of(self.folder) is not None else own,
-            part_mass=rollout.dynamics.part_mass,
-            joint_friction=rollout.dynamics.joint_friction,
-            surface_friction=rollout.dynamics.surface_friction,
+            hidden=dict(rollout.dynamics.values),
             direction=rollout.dynamics.direction,
             joint_positions=tuple(row.joint_positions.tolist()),
             point=tuple(row.action.point.tolist()),

@@ -135,8 +135,9 @@ def stages_of(dataset: Dataset, parts: Split, config: LearnerConfig) -> list[tup
     policy, other = (Policy.untrained(dataset.task, config.network, config.seed) for _ in range(2))
     known = FrozenFeatures(dataset)
     frozen = FrozenAap.of(Policy.untrained(dataset.task, config.network, config.seed).aap, known)
-    oracle = OracleCritic(Policy.untrained(dataset.task, config.network, config.seed).aap)
-    teacher = Teacher.of(OracleCritic(Policy.untrained(dataset.task, config.network, config.seed).aap), known)
+    facts = dataset.rows.facts.shape[1]
+    oracle = OracleCritic(Policy.untrained(dataset.task, config.network, config.seed).aap, facts)
+    teacher = Teacher.of(OracleCritic(Policy.untrained(dataset.task, config.network, config.seed).aap, facts), known)
     paper = config.aap.model_copy(update={"training": "paper", "batch_rollouts": config.aap.oracle_batch_rollouts})
     told = config.aap.model_copy(update={"training": "privileged"})
     stages: list[tuple[Stage, TrainingConfig]] = [

@@ -3,7 +3,7 @@
 What the camera sees is the same under every value, so that whatever differs afterwards was learnt from the tries.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import sqrt
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.reporting.words import turning
+from cluster.reporting.words import number, turning
 from collector.articulation import ArticulatedObject
 from collector.catalogue import load_ref
 from collector.clock import StageClock
@@ -125,30 +125,25 @@ class Laboratory:
 
 
 def variations(setting: Setting, target: ArticulatedObject, twins: Sequence[ArticulatedObject]) -> list[Variation]:
-    """What can be varied: three numbers of an object, its direction if the task hides it, and the side of a hinge.
+    """What can be varied: each hidden parameter, the direction if the task hides it, and the side of a hinge.
 
     Args:
         setting: of the run's evaluation.
         target: a test object.
         twins: the same cabinet hung on its left and on its right; none where the task is not about doors.
     """
-    ranges, task = setting.terms.dynamics, task_named(setting.task)
-    middle = HiddenDynamics(
-        part_mass=_middle(ranges.part_mass),
-        joint_friction=_middle(ranges.joint_friction),
-        surface_friction=_middle(ranges.surface_friction),
-        direction=task.directions[0],
-    )
+    ranges, task = setting.dynamics, task_named(setting.task)
+    middle = HiddenDynamics({name: _middle(interval) for name, interval in ranges.root.items()}, task.directions[0])
 
-    def growing(name: str, interval: Range, changed: Callable[[float], HiddenDynamics]) -> Variation:
+    def growing(name: str, interval: Range) -> Variation:
         values = (interval.low, _middle(interval), interval.high)
-        return Variation(name, tuple(Case(f"{name} {value:.2g}", target, changed(value)) for value in values))
+        cases = [
+            Case(number(name, f"{value:.2g}"), target, replace(middle, values={**middle.values, name: value}))
+            for value in values
+        ]
+        return Variation(name.replace("_", " "), tuple(cases))
 
-    found = [
-        growing("joint friction", ranges.joint_friction, lambda value: replace(middle, joint_friction=value)),
-        growing("part mass", ranges.part_mass, lambda value: replace(middle, part_mass=value)),
-        growing("surface friction", ranges.surface_friction, lambda value: replace(middle, surface_friction=value)),
-    ]
+    found = [growing(name, interval) for name, interval in ranges.root.items()]
     if len(task.directions) > 1:
         ways = tuple(Case(turning(way), target, replace(middle, direction=way)) for way in task.directions)
         found.append(Variation("direction", ways))

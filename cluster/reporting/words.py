@@ -1,15 +1,20 @@
 """What the page calls things: hidden facts, outcomes, numbers of tries."""
 
+from shared.hidden import hidden_parameter
 from shared.vocabulary import Direction, HiddenDynamics, Outcome
 
 
 def hidden(dynamics: HiddenDynamics) -> str:
     """Hidden dynamics in words."""
-    text = (
-        f"part mass {dynamics.part_mass:.2f} kg, joint friction {dynamics.joint_friction:.2f}, "
-        f"surface friction {dynamics.surface_friction:.2f}"
-    )
+    text = ", ".join(number(name, f"{value:.2f}") for name, value in dynamics.values.items())
     return text if dynamics.direction is Direction.AS_BUILT else f"{text}, {turning(dynamics.direction)}"
+
+
+def number(name: str, value: str) -> str:
+    """A hidden parameter with its value, and its unit where the package that adds it is installed."""
+    parameter = hidden_parameter(name)
+    unit = "" if parameter is None or not parameter.unit else f" {parameter.unit}"
+    return f"{name.replace('_', ' ')} {value}{unit}"
 
 
 def turning(direction: Direction) -> str:

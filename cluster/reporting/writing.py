@@ -83,6 +83,7 @@ def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Call
 
     used, setting = run.objects_used(), evaluation.setting
     try:
+        setting.dynamics.check_known()
         target = first_readable(run.objects_folder(), used.test, setting)
     except UsageError as error:
         say(str(error))

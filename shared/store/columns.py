@@ -3,15 +3,18 @@
 import hashlib
 import json
 import operator
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from shared.hidden import ALWAYS_DRAWN, NAME, hidden_parameter
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.vocabulary import Direction, Float, Order, OutcomeKind, Role
 
@@ -22,6 +25,8 @@ LIST = -1
 MAX_TEXT = 200
 """Characters of a cell, unless its column says otherwise."""
 MAX_JOINT_NAMES = 1 << 16
+HIDDEN_PREFIX = "hidden_"
+"""Before the name of a hidden parameter that not every store has; no other column begins so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +136,40 @@ class Cells:
     """Of each cell of a LIST column."""
 
 
+def _hidden_column(name: str, column: str, *, content: bool = True) -> Column[Any]:
+    """The column of a hidden parameter, whose package need not be installed."""
+    parameter = hidden_parameter(name)
+    told = parameter.in_full if parameter is not None else "of a package that was not installed"
+    return Column(column, "<f8", 0, f"hidden: {told}", lambda row: row.rollout.dynamics[name], content=content)
+
+
+@lru_cache(maxsize=1024)
+def added_column(name: str, *, content: bool) -> Column[Any]:
+    """The column of a parameter that not every store has: content of rollouts.parquet, a copy in the other table."""
+    return _hidden_column(name, HIDDEN_PREFIX + name, content=content)
+
+
+def hidden_names(added: Sequence[str]) -> dict[str, str]:
+    """The columns of hidden parameters by the parameters' names: those that every store has, then some others."""
+    return {name: name for name in ALWAYS_DRAWN} | {name: HIDDEN_PREFIX + name for name in added}
+
+
+def rollout_columns(added: Sequence[str]) -> tuple["Column[RolloutRow]", ...]:
+    """The columns of rollouts.parquet in a store with some hidden parameters that not every store has."""
+    return (*ROLLOUT_COLUMNS, *(added_column(name, content=True) for name in added))
+
+
+def interaction_columns(added: Sequence[str]) -> tuple["Column[InteractionRow]", ...]:
+    """The same of interactions.parquet."""
+    return (*INTERACTION_COLUMNS, *(added_column(name, content=False) for name in added))
+
+
+def added_in(columns: Sequence[str]) -> tuple[str, ...]:
+    """The hidden parameters that not every store has, by the names of a table's columns."""
+    names = (column.removeprefix(HIDDEN_PREFIX) for column in columns if column.startswith(HIDDEN_PREFIX))
+    return tuple(sorted(name for name in names if re.fullmatch(NAME, name)))
+
+
 def _rollout_columns() -> tuple[Column[RolloutRow], ...]:
     r = operator.attrgetter("rollout")
     return (
@@ -139,9 +178,7 @@ def _rollout_columns() -> tuple[Column[RolloutRow], ...]:
         Column("object_id", "", 0, "object", lambda x: r(x).object.id),
         Column("object_category", "", 0, "its category", lambda x: r(x).object.category),
         Column("object_hash", "", 0, "SHA-256 of its files", lambda x: r(x).object.content_hash),
-        Column("part_mass", "<f8", 0, "hidden: mass of a movable part, kg", lambda x: r(x).dynamics.part_mass),
-        Column("joint_friction", "<f8", 0, "hidden: N m or N", lambda x: r(x).dynamics.joint_friction),
-        Column("surface_friction", "<f8", 0, "hidden: coefficient", lambda x: r(x).dynamics.surface_friction),
+        *(_hidden_column(name, name) for name in ALWAYS_DRAWN),
         Column(
             "direction",
             "",

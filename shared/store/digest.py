@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from shared.records import RolloutRecord, RolloutStatus
-from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, Column, InteractionRow, RolloutRow
+from shared.store.columns import INTERACTION_COLUMNS, Column, InteractionRow, RolloutRow, rollout_columns
 from shared.store.observations import Packed, pack
 
 Row = TypeVar("Row")
@@ -29,7 +29,7 @@ def rollout_digest(rollout: RolloutRecord, clouds: Sequence[Packed] | None = Non
     if rollout.status is RolloutStatus.NEVER_AT_REST:
         # Earlier software did not tell the two apart; the same plan shall have the digest that it had.
         rollout = replace(rollout, status=RolloutStatus.NOTHING_TO_ACT_ON)
-    _add_columns(digest, ROLLOUT_COLUMNS, [RolloutRow(rollout, 0)])
+    _add_columns(digest, rollout_columns(rollout.dynamics.added), [RolloutRow(rollout, 0)])
     rows = [InteractionRow(rollout, interaction, 0) for interaction in rollout.interactions]
     _add_columns(digest, INTERACTION_COLUMNS, rows)
     for cloud in map(pack, rollout.observations) if clouds is None else clouds:

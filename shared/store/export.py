@@ -24,7 +24,7 @@ from zarr.codecs import BloscCodec
 from shared.errors import StoreError, UsageError
 from shared.files import remove_tree, temporary_name
 from shared.seeds import generator
-from shared.store.columns import INTERACTION_COLUMNS
+from shared.store.columns import INTERACTION_COLUMNS, interaction_columns
 from shared.store.coverage import ROLLOUT_COLUMN
 from shared.store.datacard import SplitFigures, data_card
 from shared.store.layout import INTERACTIONS_FILE
@@ -135,7 +135,8 @@ class _SplitWriter:
     def __init__(self, folder: Path, store: Store, objects: frozenset[str], unknown: Sequence[Any]) -> None:
         folder.mkdir()
         self._name, self._objects = folder.name, pa.array(sorted(objects), pa.string())
-        self._schema = pa.schema([*schema_of(INTERACTION_COLUMNS), *unknown])
+        columns = interaction_columns(store.setting.dynamics.added)
+        self._schema = pa.schema([*schema_of(columns), *unknown])
         self._rows = pq.ParquetWriter(folder / "interactions.parquet", self._schema, compression="zstd")
         self._clouds = zarr.create_group(folder / "observations.zarr", zarr_format=3)
         points = store.setting.collection.camera.points

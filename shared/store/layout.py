@@ -18,6 +18,7 @@ Names that begin with ".tmp-" are work in progress or its remnants; names that b
 
 import re
 import sys
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
@@ -30,6 +31,8 @@ from shared.store.sealed import is_sealed, unsealed
 
 SCHEMA_VERSION = 1
 """What the number promises, and when it grows, is told in docs/compatibility.md."""
+HIDDEN_VERSION = 2
+"""Of stores with further hidden parameters: software that knows version 1 alone would compute another digest."""
 STORE_FILE = "store.json"
 MANIFEST_FILE = "manifest.json"
 INTERACTIONS_FILE = "interactions.parquet"
@@ -60,6 +63,11 @@ MAX_REASON = 500
 _SHA256 = r"^[0-9a-f]{64}$"
 PLAN_KEY = r"[a-z][a-z0-9-]{0,30}-v[0-9]{1,9}"
 _SHARD_ID = re.compile(rf"(?P<plan>{PLAN_KEY})-(?P<start>[0-9]{{8,12}})-(?P<stop>[0-9]{{8,12}})")
+
+
+def schema_version(added: Sequence[str]) -> int:
+    """The version of documents about rollouts with some hidden parameters that not every store has."""
+    return HIDDEN_VERSION if added else SCHEMA_VERSION
 
 
 class FileEntry(StrictModel):
@@ -135,8 +143,8 @@ class ShardManifest(StrictModel):
 class StoreDocument(StrictModel):
     """What store.json says."""
 
-    schema_version: int = SCHEMA_VERSION
     setting: Setting
+    schema_version: int = Field(default_factory=lambda data: schema_version(data["setting"].dynamics.added))
     software: dict[str, str]
     created: str
     """UTC, ISO 8601."""
@@ -186,10 +194,11 @@ def check_schema_version(content: dict[str, Any], source: str) -> None:
         StoreError: it names no version, or was damaged where it names it.
     """
     version = content.get("schema_version")
-    if version == SCHEMA_VERSION:
+    versions = (SCHEMA_VERSION, HIDDEN_VERSION)
+    if version in versions and type(version) is int:
         return
     # A flipped bit in the number itself is damage: with the right number, the document is what was sealed.
-    if not isinstance(version, int) or is_sealed(content | {"schema_version": SCHEMA_VERSION}):
+    if not isinstance(version, int) or any(is_sealed(content | {"schema_version": right}) for right in versions):
         raise StoreError(f"{source}: names no schema version; the file is damaged: restore it from a copy")
     older = (
         "run `adaafford store migrate STORE --out NEW`"
@@ -197,7 +206,7 @@ def check_schema_version(content: dict[str, Any], source: str) -> None:
         else "use the software that wrote it, or newer"
     )
     raise SchemaVersionError(
-        f"{source}: schema version {version}, but this software reads version {SCHEMA_VERSION}; {older}"
+        f"{source}: schema version {version}, but this software reads {SCHEMA_VERSION} and {HIDDEN_VERSION}; {older}"
     )
 
 

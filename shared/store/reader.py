@@ -13,7 +13,7 @@ from shared.errors import StoreError
 from shared.plan import Job, ObjectRef
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store import observations
-from shared.store.columns import INTERACTION_COLUMNS, MAX_TEXT, ROLLOUT_COLUMNS
+from shared.store.columns import INTERACTION_COLUMNS, MAX_TEXT, ROLLOUT_COLUMNS, added_in, hidden_names
 from shared.store.coverage import ROLLOUT_COLUMN, Part
 from shared.store.layout import (
     INTERACTIONS_FILE,
@@ -28,7 +28,7 @@ from shared.store.layout import (
 )
 from shared.store.observations import ObservationArrays
 from shared.store.place import Folder, Place
-from shared.store.tables import column_values, read_table, size_limit, unknown_columns
+from shared.store.tables import column_values, read_table, size_limit, unknown_columns, with_added
 from shared.store.validity import MAX_PARTS, check_quarantined, check_rollouts
 from shared.vocabulary import (
     Action,
@@ -254,7 +254,8 @@ def read_rollouts(shard: Folder, manifest: ShardManifest) -> tuple[RolloutRecord
     Raises:
         StoreError: a file is damaged or foreign, or a row breaks the rules of a record.
     """
-    heads = _rows(read_rollout_table(shard, manifest), ROLLOUT_COLUMNS)
+    table = read_rollout_table(shard, manifest)
+    heads = _rows(table, with_added(ROLLOUT_COLUMNS, table.column_names))
     rows = _rows(read_interactions(shard, manifest), INTERACTION_COLUMNS)
     arrays = read_observations(shard, manifest)
     rollouts, row = [], 0
@@ -294,10 +295,8 @@ def _rollout(
         plan_key=head["plan_key"],
         object=ObjectRef(id=head["object_id"], category=head["object_category"], content_hash=head["object_hash"]),
         dynamics=HiddenDynamics(
-            part_mass=float(head["part_mass"]),
-            joint_friction=float(head["joint_friction"]),
-            surface_friction=float(head["surface_friction"]),
-            direction=Direction(head["direction"]),
+            {name: float(head[column]) for name, column in hidden_names(added_in(list(head))).items()},
+            Direction(head["direction"]),
         ),
         azimuth_deg=float(head["azimuth_deg"]),
         elevation_deg=float(head["elevation_deg"]),

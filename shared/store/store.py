@@ -13,13 +13,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from shared.errors import StoreError, UnreadableError, UsageError
 from shared.files import TEMPORARY_PREFIX
+from shared.hidden import hidden_parameter
 from shared.plan import Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import policies, reader
+from shared.store.columns import added_in, interaction_columns, rollout_columns
 from shared.store.conformance import check_place
 from shared.store.coverage import Part, parts_of
 from shared.store.difference import difference_of
@@ -46,7 +49,7 @@ from shared.store.presence import DRIVER
 from shared.store.provenance import store_software
 from shared.store.sealed import seal
 from shared.store.snapshot import Snapshot
-from shared.store.tables import INTERACTION_SCHEMA, ROLLOUT_SCHEMA
+from shared.store.tables import schema_of
 from shared.store.writer import commit_shard
 from shared.underway import UNDERWAY_FOLDER, Underway
 
@@ -263,6 +266,10 @@ class Store:
                     f"{job.shard_id}: rollout {rollout.index} (object {rollout.object.id}, seed {rollout.seed}) "
                     "is of another object or seed than the store's"
                 )
+            if rollout.dynamics.added != self.setting.dynamics.added:
+                raise StoreError(
+                    f"{job.shard_id}: rollout {rollout.index} has other hidden parameters than the store's"
+                )
         points = self.setting.collection.camera.points
         return commit_shard(self.place, job, rollouts, points, provenance, quarantined, vetted=vetted)
 
@@ -297,22 +304,28 @@ class Store:
         """A pyarrow table, one row an interaction; "shard" and "observation" (index in it) find a row's cloud.
 
         Args:
-            columns: names (see `shared.store.columns`); None: all. "shard" and "observation" always come.
+            columns: names (see `shared.store.columns`); None: all. "shard" and "observation" always come. A hidden
+                parameter that the store lacks has its default in every row, where the package that adds it says one.
             plan_keys: rows of these plans only; None: all.
 
         Raises:
             UsageError: there is no such column.
             StoreError: a file is damaged or foreign.
         """
-        names = list(INTERACTION_SCHEMA.names if columns is None else dict.fromkeys([*columns, "observation"]))
-        names = [name for name in names if name != "shard"]
+        known = schema_of(interaction_columns(self.setting.dynamics.added))
+        names = list(known.names if columns is None else dict.fromkeys([*columns, "observation"]))
+        lacking = {name: default for name in names if name not in known.names for default in _defaults(name)}
+        names = [name for name in names if name != "shard" and name not in lacking]
         for name in names:
-            if name not in INTERACTION_SCHEMA.names:
-                close = difflib.get_close_matches(name, INTERACTION_SCHEMA.names, n=1)
-                hint = f"did you mean '{close[0]}'?" if close else f"allowed: {', '.join(INTERACTION_SCHEMA.names)}"
+            if name not in known.names:
+                close = difflib.get_close_matches(name, known.names, n=1)
+                hint = f"did you mean '{close[0]}'?" if close else f"allowed: {', '.join(known.names)}"
                 raise UsageError(f"no column '{name}' in the interactions; {hint}")
-        schema = pa.schema([INTERACTION_SCHEMA.field(name) for name in names])
-        return _one_table(schema, self.each(INTERACTIONS_FILE, names, plan_keys))
+        schema = pa.schema([known.field(name) for name in names])
+        table = _one_table(schema, self.each(INTERACTIONS_FILE, names, plan_keys))
+        for name, default in lacking.items():
+            table = table.append_column(name, pa.array(np.full(len(table), default)))
+        return table
 
     def rollouts(self) -> Any:
         """A pyarrow table, one row a rollout, those without interactions included; "shard" says where it lies.
@@ -320,7 +333,8 @@ class Store:
         Raises:
             StoreError: a file is damaged or foreign.
         """
-        return _one_table(ROLLOUT_SCHEMA, self.each(ROLLOUTS_FILE, ROLLOUT_SCHEMA.names))
+        schema = schema_of(rollout_columns(self.setting.dynamics.added))
+        return _one_table(schema, self.each(ROLLOUTS_FILE, schema.names))
 
     def each(
         self, file: str, names: Sequence[str] | None = None, plan_keys: Sequence[str] | None = None
@@ -387,6 +401,12 @@ class Store:
         if parse_shard_id(shard_id) is None or not reader.is_committed(folder):
             raise StoreError(f"{self.where}: holds no committed shard {shard_id[:80]!r}; see `store info`")
         return folder
+
+
+def _defaults(column: str) -> list[float]:
+    """What the hidden parameter of a column was where a store lacks it; empty where nothing says so."""
+    found = [hidden_parameter(name) for name in added_in([column])]
+    return [each.default for each in found if each is not None and each.default is not None]
 
 
 def _refuse_foreign(place: Place) -> None:

@@ -1,7 +1,7 @@
 """Parquet: rows to bytes and hostile bytes to columns."""
 
 from collections.abc import Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 
 from shared.errors import StoreError
 from shared.plain import MAX_WORD, plain
-from shared.store.columns import INTERACTION_COLUMNS, LIST, ROLLOUT_COLUMNS, Column
+from shared.store.columns import LIST, Column, added_column, added_in
 from shared.store.pages import unpacked_size
 
 Row = TypeVar("Row")
@@ -28,10 +28,6 @@ MAX_FOOTER_ITEMS = 256
 def schema_of(columns: Columns) -> Any:
     """The pyarrow schema of some columns."""
     return pa.schema([column.field for column in columns])
-
-
-ROLLOUT_SCHEMA = schema_of(ROLLOUT_COLUMNS)
-INTERACTION_SCHEMA = schema_of(INTERACTION_COLUMNS)
 
 
 def size_limit(rows: int) -> int:
@@ -71,7 +67,8 @@ def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Seq
 
     Args:
         data: a Parquet file.
-        columns: what it must hold; what has a default may be missing.
+        columns: what it must hold; what has a default may be missing. Further hidden parameters may come beside
+            them, whether their packages are installed here or not.
         rows: how many rows it must have.
         source: what messages call it.
         names: read these columns only.
@@ -81,7 +78,7 @@ def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Seq
             column does not allow.
     """
     try:
-        table = _read(data, columns, rows, source, names)
+        table, columns = _read(data, columns, rows, source, names)
     except (pa.ArrowException, OSError, ValueError, LookupError, OverflowError) as error:
         if isinstance(error, StoreError):
             raise
@@ -120,9 +117,14 @@ def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Seq
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
 
 
+def with_added(columns: Columns, there: Sequence[str]) -> Columns:
+    """Columns, and those of further hidden parameters among what is there."""
+    return (*columns, *(added_column(name, content=False) for name in added_in(there)))
+
+
 def unknown_columns(table: Any, columns: Columns, key: str) -> Any:
     """Columns of a table that this software does not know, beside its column `key`; missing values may be filled in."""
-    known = {column.name for column in columns}
+    known = {column.name for column in with_added(columns, table.column_names)}
     fields = [field for field in table.schema if field.name == key or field.name not in known]
     return table.select([field.name for field in fields]).cast(pa.schema([f.with_nullable(True) for f in fields]))
 
@@ -141,11 +143,12 @@ def joined(tables: Sequence[Any], source: str) -> Any:
         ) from None
 
 
-def _read(data: bytes, columns: Columns, rows: int, source: str, names: Sequence[str] | None) -> Any:
-    """Some columns, or all; texts as dictionaries, which do not grow by being repeated."""
+def _read(data: bytes, columns: Columns, rows: int, source: str, names: Sequence[str] | None) -> tuple[Any, Columns]:
+    """Some columns, or all, and which are known; texts as dictionaries, which do not grow by being repeated."""
     texts = [column.name for column in columns if not column.dtype and column.default is None]
     file = _open(data, texts)
     there = file.schema_arrow
+    columns = with_added(columns, there.names)
     _check_columns(there, columns, source)
     wanted = [name for name in there.names if names is None or name in names]
     if more := [name for name in wanted if pa.types.is_string(there.field(name).type)]:
@@ -164,7 +167,7 @@ def _read(data: bytes, columns: Columns, rows: int, source: str, names: Sequence
     table.validate(full=True)
     if len(table) != rows:
         raise ValueError(f"{len(table)} rows in the columns")
-    return table
+    return table, columns
 
 
 def _open(data: bytes, texts: Sequence[str]) -> Any:
@@ -231,7 +234,7 @@ def _size_of_texts(cells: Any) -> int:
     return size
 
 
-@cache
+@lru_cache(maxsize=64)
 def _schema_when_read(columns: tuple[Column[Any], ...]) -> Any:
     texts = pa.dictionary(pa.int32(), pa.string())
     return pa.schema(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from shared.errors import StoreError
+from shared.hidden import ALWAYS_DRAWN
 from shared.plan import Job
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store.columns import MAX_TEXT
@@ -39,6 +40,8 @@ def check_rollouts(rollouts: Sequence[RolloutRecord], job: Job, points: int, sou
         )
     for rollout in rollouts:
         try:
+            if rollout.dynamics.added != rollouts[0].dynamics.added:
+                raise ValueError("has other hidden parameters than the rollout before it")
             if rollout.plan_key != job.plan_key:
                 raise ValueError(f"belongs to plan '{rollout.plan_key}', not '{job.plan_key}'")
             _check_rollout(rollout, points)
@@ -60,6 +63,8 @@ def check_quarantined(rollouts: Sequence[RolloutRecord], quarantined: Sequence[Q
 
 def _check_rollout(rollout: RolloutRecord, points: int) -> None:
     _check_texts(rollout.fidelity, rollout.status, rollout.object.category)
+    if missing := ALWAYS_DRAWN.keys() - rollout.dynamics.values.keys():
+        raise ValueError(f"lacks the hidden parameter '{min(missing)}'")
     _check_finite("rollout's numbers", _rollout_numbers(rollout))
     for observation in rollout.observations:
         check_observation(observation, points)
@@ -76,9 +81,7 @@ def _check_rollout(rollout: RolloutRecord, points: int) -> None:
 
 
 def _rollout_numbers(rollout: RolloutRecord) -> list[float]:
-    dynamics = rollout.dynamics
-    hidden = [dynamics.part_mass, dynamics.joint_friction, dynamics.surface_friction]
-    return [*hidden, rollout.azimuth_deg, rollout.elevation_deg]
+    return [*rollout.dynamics.values.values(), rollout.azimuth_deg, rollout.elevation_deg]
 
 
 def _check_interaction(interaction: InteractionRecord, rollout: RolloutRecord) -> None:

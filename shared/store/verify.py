@@ -12,7 +12,7 @@ from shared.files import TEMPORARY_PREFIX
 from shared.plan import Job
 from shared.records import RolloutRecord
 from shared.store import reader
-from shared.store.columns import COPIED_COLUMNS, INTERACTION_COLUMNS, InteractionRow
+from shared.store.columns import COPIED_COLUMNS, InteractionRow, added_in, hidden_names, interaction_columns
 from shared.store.coverage import Window, overlapping
 from shared.store.digest import rollout_digest
 from shared.store.layout import (
@@ -138,9 +138,12 @@ def _content(store: Store, shard: Folder, manifest: ShardManifest) -> Iterator[P
         if rollout_digest(rollout) != digest:
             yield _problem(shard.key, f"rollout {rollout.index} is not the one whose digest the manifest states")
     known = store.setting.identities
+    added = store.setting.dynamics.added
     for rollout in rollouts:
         if rollout.object.identity not in known or rollout.seed != store.setting.seed:
             yield _problem(shard.key, f"rollout {rollout.index} is of another object or seed than the store's")
+        if rollout.dynamics.added != added:
+            yield _problem(shard.key, f"rollout {rollout.index} has other hidden parameters than the store's")
     yield from _copies(shard, manifest, rollouts)
 
 
@@ -149,8 +152,13 @@ def _copies(shard: Folder, manifest: ShardManifest, rollouts: tuple[RolloutRecor
     firsts = np.cumsum([0, *(len(rollout.observations) for rollout in rollouts)]).tolist()
     rows = [InteractionRow(r, i, first) for r, first in zip(rollouts, firsts, strict=False) for i in r.interactions]
     table = reader.read_interactions(shard, manifest)
-    for column in INTERACTION_COLUMNS:
-        if column.name not in (*COPIED_COLUMNS, "observation", "point_camera", "rotation_camera"):
+    added = rollouts[0].dynamics.added
+    if added_in(table.column_names) != added:
+        yield _problem(shard.key, "the interactions have columns of other hidden parameters than the rollouts")
+        return
+    restated = {*COPIED_COLUMNS, *hidden_names(added).values(), "observation", "point_camera", "rotation_camera"}
+    for column in interaction_columns(added):
+        if column.name not in restated:
             continue
         cells, kept = column.gather(rows), column_values(table, column)
         if column.dtype:

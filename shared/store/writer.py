@@ -10,7 +10,7 @@ from shared.plan import Job
 from shared.records import RolloutRecord
 from shared.reproduction import OBJECTS, STORE, reproduction
 from shared.store import observations
-from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, InteractionRow, RolloutRow
+from shared.store.columns import InteractionRow, RolloutRow, interaction_columns, rollout_columns
 from shared.store.digest import rollout_digest
 from shared.store.layout import (
     INTERACTIONS_FILE,
@@ -24,6 +24,7 @@ from shared.store.layout import (
     ShardManifest,
     parse_manifest,
     parse_shard_id,
+    schema_version,
 )
 from shared.store.place import Folder, Place, Publication
 from shared.store.provenance import process_provenance, store_software
@@ -81,6 +82,7 @@ def commit_shard(
     clouds = [[observations.pack(observation) for observation in rollout.observations] for rollout in rollouts]
     files = _encode(rollouts, clouds, points, unknown.tables)
     manifest = ShardManifest(
+        schema_version=schema_version(rollouts[0].dynamics.added),
         plan_key=job.plan_key,
         start=job.start,
         stop=job.stop,
@@ -164,10 +166,11 @@ def _encode(
         rollout_rows.append(RolloutRow(rollout, first))
         interaction_rows += [InteractionRow(rollout, interaction, first) for interaction in rollout.interactions]
         first += len(rollout.observations)
+    added = rollouts[0].dynamics.added
     group = observations.encode([cloud for of_rollout in clouds for cloud in of_rollout], points)
     return {
-        ROLLOUTS_FILE: table_bytes(ROLLOUT_COLUMNS, rollout_rows, unknown.get(ROLLOUTS_FILE)),
-        INTERACTIONS_FILE: table_bytes(INTERACTION_COLUMNS, interaction_rows, unknown.get(INTERACTIONS_FILE)),
+        ROLLOUTS_FILE: table_bytes(rollout_columns(added), rollout_rows, unknown.get(ROLLOUTS_FILE)),
+        INTERACTIONS_FILE: table_bytes(interaction_columns(added), interaction_rows, unknown.get(INTERACTIONS_FILE)),
         **{f"{OBSERVATIONS_FOLDER}/{name}": data for name, data in group.items()},
     }
 

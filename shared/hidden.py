@@ -1,0 +1,127 @@
+"""Hidden parameters: what cannot be seen of an object, is drawn once a rollout, and must be inferred from interactions.
+
+Each is declared in one record. Drawing, settings, columns of the store, facts for the oracle, and the words and tables
+of the report follow from it. A package adds one by an entry point of the group `adaafford.hidden_parameters`
+(docs/extending.md). All but the first three are active only in settings that name them in `collection.dynamics`.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from shared.errors import UsageError
+from shared.extensions import Registry
+
+NAME = r"^[a-z][a-z0-9_]{0,39}$"
+_RESERVED = ("direction", "values")
+
+
+class HiddenTarget(Protocol):
+    """What a parameter is applied to: one object in a simulator, before anything has moved."""
+
+    def set_part_mass(self, mass: float) -> None:
+        """Give every movable part this mass, kg; its inertia is scaled along."""
+        ...
+
+    def set_joint_friction(self, limit: float) -> None:
+        """Give every movable joint this Coulomb friction: N m if it turns, N if it slides."""
+        ...
+
+    def set_surface_friction(self, coefficient: float) -> None:
+        """Give the surfaces of hand and object this friction coefficient."""
+        ...
+
+    @property
+    def links(self) -> Sequence[Any]:
+        """The simulator's own handles of the movable parts, in part order."""
+        ...
+
+    @property
+    def joints(self) -> Sequence[Any]:
+        """The simulator's own handles of the joints that they hang on."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class HiddenParameter:
+    """One hidden parameter.
+
+    Attributes:
+        name: lower-case letters, digits and underscores; settings, columns and the report call it this.
+        description: what it is, in a few words.
+        unit: "" for none.
+        low: of the range that it is drawn from, where the setting does not say otherwise.
+        high: likewise.
+        log: whether the logarithm is uniform instead of the value.
+        apply: puts a value into force on a simulated object; called once a rollout.
+        default: what held where stores lack it: what the simulator does where it is not applied. None: every store has
+            it, which only the first three can say.
+    """
+
+    name: str
+    description: str
+    unit: str
+    low: float
+    high: float
+    log: bool
+    apply: Callable[[HiddenTarget, float], None]
+    default: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a record that no setting could hold."""
+        if not re.fullmatch(NAME, self.name) or self.name in ("direction", "values"):
+            raise ValueError(
+                f"a hidden parameter cannot be called '{self.name}'; allowed: {NAME}, not direction or values"
+            )
+
+    @property
+    def in_full(self) -> str:
+        """The description with the unit."""
+        return f"{self.description}, {self.unit}" if self.unit else self.description
+
+
+BUILT_IN = {
+    parameter.name: parameter
+    for parameter in (
+        HiddenParameter(
+            name="part_mass",
+            description="mass of a movable part; its inertia is scaled along",
+            unit="kg",
+            low=0.05,
+            high=0.5,
+            log=True,
+            apply=lambda target, value: target.set_part_mass(value),
+        ),
+        HiddenParameter(
+            name="joint_friction",
+            description="Coulomb friction of a movable joint, N m if it turns, N if it slides",
+            unit="",
+            low=0.05,
+            high=2.0,
+            log=True,
+            apply=lambda target, value: target.set_joint_friction(value),
+        ),
+        HiddenParameter(
+            name="surface_friction",
+            description="friction coefficient between hand and object",
+            unit="",
+            low=0.2,
+            high=10.0,
+            log=True,
+            apply=lambda target, value: target.set_surface_friction(value),
+        ),
+    )
+}
+ALWAYS_DRAWN = {name: parameter for name, parameter in BUILT_IN.items() if parameter.default is None}
+"""Those that every setting draws and every store has, in the order in which they are drawn and told to the oracle."""
+
+HIDDEN_PARAMETERS = Registry("hidden parameter", HiddenParameter, BUILT_IN)
+
+
+def hidden_parameter(name: str) -> HiddenParameter | None:
+    """The parameter called `name`; None where the package that adds it is not installed here, or is broken."""
+    with suppress(UsageError):
+        return HIDDEN_PARAMETERS.get(name)
+    return None
