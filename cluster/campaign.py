@@ -38,7 +38,6 @@ from shared.plain import plain
 from shared.plan import Plan, Setting
 from shared.store import Store
 from shared.store.provenance import changed_versions, software_versions
-from shared.tasks import task_named
 
 
 class Crew:
@@ -123,7 +122,7 @@ class Campaign:
     def _choose_objects(self) -> Mapping[str, Any]:
         """Decide which objects are trained on and which are kept for the end, and make both stores."""
         run, config = self._run, self._config
-        task = task_named(config.task)
+        task = config.task_record
         per_category = config.procedural.per_category
         built_in, lists = run.generated_objects.resolve(), lists_of(config.splits)
         catalogue, folder = objects_for(task, config, built_in, per_category, config.seed, lists)
@@ -159,9 +158,10 @@ class Campaign:
         return Setting(
             kind="evaluation" if evaluation else "collection",
             task=config.task,
+            task_definition=config.task_definition,
             seed=config.seed,
             objects=tuple(sorted(objects, key=lambda ref: ref.id)),
-            collection=task_named(config.task).resolve(config.collection),
+            collection=config.task_record.resolve(config.collection),
             evaluation=config.evaluation if evaluation else None,
         )
 

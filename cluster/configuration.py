@@ -94,7 +94,7 @@ class CampaignConfig(ObjectSelection):
     """One campaign: a random round, then alternating training and AIP rounds, then evaluation on unseen objects."""
 
     task: str = "pull-closed-door"
-    """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
+    """Which manipulation task: push, pull, pull-closed-door, push-faucet, one that a package adds, or a TOML file."""
     seed: int = Field(1, ge=0, lt=2**63)
     """Everything random derives from it."""
     alternations: int = Field(1, ge=0, le=1000)

@@ -22,7 +22,7 @@ from shared.networks.configuration import NetworkConfig
 from shared.networks.where2act_interaction import TRIES
 from shared.plan import ObjectRef
 from shared.policy import Policy
-from shared.tasks import Task, task_named
+from shared.tasks import Task
 from shared.vocabulary import Order
 
 
@@ -119,7 +119,7 @@ def estimate(config: CampaignConfig, rates: Rates = RATES) -> Estimate:
     Raises:
         UsageError: a folder or list of objects cannot be read, or too few suit the task.
     """
-    parts = _objects(task_named(config.task), config)
+    parts = _objects(config.task_record, config)
     counts = len(parts.train), len(parts.validation), len(parts.test)
     if not counts[0] or not counts[2]:
         raise UsageError(f"{sum(counts)} usable objects are too few to train on some and test on others")
@@ -145,7 +145,7 @@ class _Costs:
 
     def __init__(self, config: CampaignConfig, objects: tuple[int, int, int], rates: Rates) -> None:
         self.config, self.rates = config, rates
-        self.task = task_named(config.task)
+        self.task = config.task_record
         train, validation, self.tested = objects
         self.collected_on = train + validation
         camera, network = config.collection.camera, config.learner.network

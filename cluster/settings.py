@@ -106,6 +106,8 @@ def parse_flags(command: type[Command], args: list[str], prog: str, default: Com
         )
     except ValidationError as error:
         problem = error.errors()[0]
+        if isinstance(cause := problem.get("ctx", {}).get("error"), UsageError):
+            raise cause from None
         name = ".".join(str(part) for part in problem["loc"])
         raise UsageError(f"flag for '{name}': {problem['msg']}; given {str(problem['input'])[:80]!r}") from None
     assert parsed is not None

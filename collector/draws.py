@@ -11,7 +11,7 @@ import numpy as np
 from shared import seeds
 from shared.configuration import DynamicsRanges, Range
 from shared.plan import ObjectRef, Plan
-from shared.tasks import Task, task_named
+from shared.tasks import Task
 from shared.vocabulary import HiddenDynamics
 
 
@@ -28,9 +28,9 @@ class Draw:
 
 def draw_rollout(plan: Plan, index: int, attempt: int = 0) -> Draw:
     """The draw of rollout `index`; a further `attempt` draws another camera only."""
-    setting, task = plan.setting, task_named(plan.setting.task)
+    setting = plan.setting
     rng = seeds.generator(setting.seed, f"dynamics/{plan.key}", index)
-    dynamics = draw_dynamics(setting.terms.dynamics, task, rng)
+    dynamics = draw_dynamics(setting.terms.dynamics, setting.task_record, rng)
     camera = setting.collection.camera
     rng = seeds.generator(setting.seed, f"camera/{plan.key}", index, attempt)
     return Draw(

@@ -13,7 +13,6 @@ from shared import seeds
 from shared.geometry import camera_pose
 from shared.plan import Plan
 from shared.records import RolloutRecord, RolloutStatus
-from shared.tasks import task_named
 from shared.vocabulary import Order, Proposer, Role
 
 TRIES = 8
@@ -68,11 +67,11 @@ def make_environment(
     plan: Plan, draw: Draw, target: ArticulatedObject, clock: StageClock, attempt: int = 0
 ) -> SapienEnvironment:
     """The simulated environment of one rollout."""
-    setting, task = plan.setting, task_named(plan.setting.task)
+    setting = plan.setting
     camera = setting.collection.camera
     return SapienEnvironment(
         target,
-        task,
+        setting.task_record,
         setting.terms.primitive,
         draw.dynamics,
         camera_pose(draw.azimuth_deg, draw.elevation_deg, camera.distance),

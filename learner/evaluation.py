@@ -23,7 +23,7 @@ from shared.errors import StoreError
 from shared.methods import METHODS, CriticName, method_named
 from shared.policy import Policy
 from shared.store.store import Store
-from shared.tasks import task_named
+from shared.tasks import TASKS, task_named
 from shared.vocabulary import Role
 
 PRIOR_METHOD = "where2act"
@@ -166,7 +166,7 @@ def evaluate(
         StoreError: there is no QUERY row, or the data set is of a task with another primitive than a policy's.
     """
     for policy in policies.values():
-        if task_named(policy.task).primitive is not task_named(dataset.task).primitive:
+        if policy.task != dataset.task and _primitive(policy.task) != _primitive(dataset.task):
             raise StoreError(f"the store is of task '{dataset.task}', but a policy of '{policy.task}'")
         policy.modules().eval()
     judge = _Judge(dataset, policies)
@@ -181,6 +181,11 @@ def evaluate(
         critic = judge.critic(method.critic, method.policy_version(version))
         rows += [judge.row(name, budget, critic) for budget in method.budgets(budgets)]
     return rows
+
+
+def _primitive(task: str) -> str | None:
+    """What a task executes; None of one that a file defined, which whoever named both has compared."""
+    return task_named(task).primitive if task in TASKS.names() else None
 
 
 def _methods(dataset: Dataset) -> list[str]:

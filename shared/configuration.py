@@ -3,7 +3,7 @@
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -17,6 +17,8 @@ MAX_DOTS = 100
 """In a line of a configuration file, paths included."""
 
 Collision = Literal["hulls", "decomposed"]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")]
+"""Of what is found by name (see `shared.extensions`); it stands in file names, flags and keys of plans."""
 
 
 class StrictModel(BaseModel):
@@ -197,6 +199,9 @@ def parse(model: type[Model], values: dict[str, Any], source: str) -> Model:
     try:
         return model.model_validate(values)
     except ValidationError as error:
+        cause = error.errors()[0].get("ctx", {}).get("error") if error.error_count() == 1 else None
+        if isinstance(cause, UsageError):
+            raise cause from None  # It names the file itself.
         raise UsageError(f"{source}: {_first_problem(model, error)}") from None
 
 

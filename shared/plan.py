@@ -8,11 +8,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import FailFast, Field
+from pydantic import FailFast, Field, model_validator
 
 from shared.configuration import CollectionConfig, StrictModel
 from shared.methods import MethodName
-from shared.tasks import Terms, task_named
+from shared.tasks import Task, Terms, task_named
 
 
 class ObjectRef(StrictModel):
@@ -54,10 +54,27 @@ class Setting(StrictModel):
 
     kind: Literal["collection", "evaluation"] = "collection"
     task: str
+    task_definition: Task | None = Field(None, exclude_if=lambda task: task is None)
+    """The task itself where a file defined it, so that a store says all that was decided; None: found by its name."""
     seed: int = Field(ge=0)
     objects: Annotated[tuple[ObjectRef, ...], FailFast(), Field(min_length=1)]
     collection: CollectionConfig
     evaluation: EvaluationConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_task(self) -> "Setting":
+        if self.task_definition is not None and self.task_definition.name != self.task:
+            raise ValueError(f"the task is '{self.task}', but '{self.task_definition.name}' is defined")
+        return self
+
+    @property
+    def task_record(self) -> Task:
+        """The task.
+
+        Raises:
+            UsageError: there is no such task; the package that adds it may not be installed.
+        """
+        return self.task_definition or task_named(self.task)
 
     @property
     def identities(self) -> frozenset[tuple[str, str, str]]:
@@ -71,7 +88,7 @@ class Setting(StrictModel):
         Raises:
             UsageError: there is no such task.
         """
-        return task_named(self.task).terms(self.collection)
+        return self.task_record.terms(self.collection)
 
 
 class Plan(StrictModel):

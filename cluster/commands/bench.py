@@ -14,7 +14,6 @@ from cluster.selection import ObjectSelection
 from cluster.settings import parse_flags
 from shared.configuration import FIDELITIES, CollectionConfig, Fidelity
 from shared.errors import UsageError
-from shared.tasks import task_named
 from shared.vocabulary import Primitive
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ class BenchSettings(ObjectSelection):
     """What every benchmark may be told."""
 
     task: str = "push"
-    """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
+    """Which manipulation task: push, pull, pull-closed-door, push-faucet, one that a package adds, or a TOML file."""
     primitive: Primitive | None = None
     """Instead of the task's own primitive."""
     seed: int = Field(1, ge=0, lt=2**63)
@@ -237,7 +236,7 @@ def _print_collect(result: dict[str, Any]) -> None:
 @contextmanager
 def planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
     """A plan of random interactions, and the folder of its objects; built-in objects last as long as the context."""
-    task = task_named(command.task)
+    task = command.task_record
     from cluster.objects import objects_for
     from shared.plan import Plan, Setting
 
@@ -247,7 +246,14 @@ def planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
         built_in = Path(scratch) / "objects"
         catalogue, folder = objects_for(task, command, built_in, command.procedural_per_category, command.seed)
         refs = tuple(entry.ref for entry in catalogue.usable)
-        yield Plan(setting=Setting(task=task.name, seed=command.seed, objects=refs, collection=config)), folder
+        setting = Setting(
+            task=task.name,
+            task_definition=command.task_definition,
+            seed=command.seed,
+            objects=refs,
+            collection=config,
+        )
+        yield Plan(setting=setting), folder
 
 
 def finish(command: BenchSettings, name: str, result: dict[str, Any]) -> int:

@@ -15,7 +15,7 @@ from cluster.settings import early_flags, layered, parse_flags
 from shared.configuration import CollectionConfig
 from shared.errors import StoreError, UsageError
 from shared.plan import ROLLOUTS_PER_SHARD
-from shared.tasks import task_named
+from shared.tasks import Task
 
 if TYPE_CHECKING:
     from shared.plan import ObjectRef
@@ -27,7 +27,7 @@ class CollectSettings(ObjectSelection):
     """What `adaafford collect` may be told by a file as well."""
 
     task: str = "push"
-    """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
+    """Which manipulation task: push, pull, pull-closed-door, push-faucet, one that a package adds, or a TOML file."""
     rollouts: int = Field(100, ge=1)
     """How many the store shall hold of this plan, those of earlier attempts included; with --policy latest, of this
     proposer with any policy."""
@@ -76,12 +76,12 @@ def main(args: list[str]) -> int:
     config = Path(early["config"]) if early["config"] else None
     defaults = CollectCommand(layered(CollectSettings, None, config), tyro.MISSING, config=config)
     command = parse_flags(CollectCommand, args, "collect", defaults)
-    task_named(command.settings.task)
+    task = command.settings.task_record
     if (command.proposer == "aip") != (command.policy == "latest" or command.policy > 0):
         raise UsageError("the proposer 'aip' needs --policy VERSION (1 or more, or latest), and 'random' takes none")
     if command.settings.per_version is not None and command.policy != "latest":
         raise UsageError("--per-version is about the versions of --policy latest; without that, give --rollouts alone")
-    _collect(command)
+    _collect(command, task)
     return 0
 
 
@@ -104,7 +104,7 @@ def _begun_with(where: str, found: "tuple[ObjectRef, ...]") -> "tuple[ObjectRef,
     return known
 
 
-def _collect(command: CollectCommand) -> None:
+def _collect(command: CollectCommand, task: Task) -> None:
     from cluster.collection import Newest, collect
     from cluster.fleet import make_worker
     from cluster.objects import objects_for
@@ -117,17 +117,18 @@ def _collect(command: CollectCommand) -> None:
 
     chosen, where = command.settings, absolute(command.store)
     catalogue, folder = objects_for(
-        task_named(chosen.task),
+        task,
         chosen,
         folder_beside(where, "objects"),
         chosen.procedural_per_category,
         chosen.seed,
     )
     setting = Setting(
-        task=chosen.task,
+        task=task.name,
+        task_definition=chosen.task_definition,
         seed=chosen.seed,
         objects=_begun_with(where, tuple(entry.ref for entry in catalogue.usable)),
-        collection=task_named(chosen.task).resolve(chosen.collection),
+        collection=task.resolve(chosen.collection),
     )
     store = Store.create(where, setting)
     if changed := changed_versions(store.document.software):
