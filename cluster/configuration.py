@@ -6,9 +6,8 @@ from pydantic import Field, field_validator, model_validator
 
 from cluster.selection import ObjectSelection, RayAddress
 from collector.guard import Limits
-from learner.configuration import AapConfig, AdaptationConfig, AipConfig, InteractionConfig, PriorConfig
+from learner.configuration import LearnerSettings
 from shared.configuration import CollectionConfig, StrictModel
-from shared.networks.configuration import NetworkConfig
 from shared.plan import ROLLOUTS_PER_SHARD, EvaluationConfig
 
 EXECUTION_SETTINGS = frozenset({"workers", "ray_address", "rollout_limit_s", "memory_limit_mb"})
@@ -77,17 +76,6 @@ class ProceduralConfig(StrictModel):
 
     per_category: int = Field(8, ge=1, le=10_000)
     """Objects of each category that the task applies to."""
-
-
-class LearnerSettings(StrictModel):
-    """What the learner is told, apart from the seed, which is the campaign's."""
-
-    network: NetworkConfig = NetworkConfig()
-    prior: PriorConfig = PriorConfig()
-    aap: AapConfig = AapConfig()
-    aip: AipConfig = AipConfig()
-    interaction: InteractionConfig = InteractionConfig()
-    adaptation: AdaptationConfig = AdaptationConfig()
 
 
 class CampaignConfig(ObjectSelection):

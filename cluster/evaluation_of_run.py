@@ -136,7 +136,7 @@ def _objects(
 
 def _possible_methods(policy: Policy) -> tuple[MethodName, ...]:
     """The methods whose networks are trained."""
-    return tuple(name for name, method in METHODS.items() if policy.trained.issuperset(method.modules))
+    return tuple(name for name in METHODS.names() if policy.trained.issuperset(METHODS.get(name).modules))
 
 
 def _default_out(run: RunFolder, setting: Setting, folder: Path, version: int) -> Path:

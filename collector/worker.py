@@ -19,6 +19,7 @@ from collector.proposers import RandomProposer
 from collector.receipt import Receipt
 from collector.rollout import quarantined_rollout, run_rollout
 from shared.adaptation import Adapter
+from shared.methods import PROPOSERS, needs_policy
 from shared.plan import Job, Plan
 from shared.policy import Policy
 from shared.proposers import proposer_named
@@ -118,6 +119,8 @@ class Worker:
         """The proposer called `name`, of a policy version."""
         if name == RandomProposer.name:
             return RandomProposer(rng, plan.setting.terms.edge_share)
+        if name in PROPOSERS.names() and not needs_policy(name):
+            return proposer_named(name, None, rng, plan.most_tries)
         if version not in self._adapters:
             self.load_policy(version, self._store.read_policy(version))
         return proposer_named(name, self._adapters[version], rng, plan.most_tries)

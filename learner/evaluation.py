@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from learner.bootstrap import ratio_interval
-from learner.critics import OracleScores, RowCritic, row_critic
+from learner.critics import OracleScores, row_critic
 from learner.data import Dataset, load_dataset
 from learner.features import FrozenFeatures
 from learner.metrics import THRESHOLD, discrimination
 from learner.oracle import OracleCritic
+from learner.recipes import RowCritic
 from shared.errors import StoreError
 from shared.methods import METHODS, CriticName, method_named
 from shared.policy import Policy
@@ -195,10 +196,10 @@ def _methods(dataset: Dataset) -> list[str]:
         StoreError: a row is of a method that there is not.
     """
     found = set(dataset.rows.method.tolist()) - {""}
-    unknown = sorted(found - METHODS.keys())
+    unknown = sorted(found.difference(METHODS.names()))
     if unknown:
-        raise StoreError(f"the store holds rows of method '{unknown[0][:40]}'; known: {', '.join(METHODS)}")
-    return [name for name in METHODS if name in found and name != PRIOR_METHOD]
+        raise StoreError(f"the store holds rows of method '{unknown[0][:40]}'; known: {', '.join(METHODS.names())}")
+    return [name for name in METHODS.names() if name in found and name != PRIOR_METHOD]
 
 
 class _Judge:

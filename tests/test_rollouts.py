@@ -202,7 +202,7 @@ def test_methods_use_their_own_proposers_budgets_and_policies(objects: Path) -> 
     plan = plan_for(objects, kind="evaluation", evaluation=evaluation).model_copy(update={"policy_version": 3})
     record = rollout(plan, objects)
     for name in methods:
-        method, rows = METHODS[name], [row for row in record.interactions if row.method == name]
+        method, rows = METHODS.get(name), [row for row in record.interactions if row.method == name]
         version = 1 if name == "ours-no-iteration" else 3
         assert {row.policy_version for row in rows} == {version}
         tries = [row for row in rows if row.role is Role.CONTEXT]

@@ -14,6 +14,7 @@ from cluster.selection import ObjectSelection, RayAddress
 from cluster.settings import early_flags, layered, parse_flags
 from shared.configuration import CollectionConfig
 from shared.errors import StoreError, UsageError
+from shared.methods import RANDOM, needs_policy
 from shared.plan import ROLLOUTS_PER_SHARD
 from shared.tasks import Task
 
@@ -59,11 +60,11 @@ class CollectCommand:
     settings: Annotated[CollectSettings, tyro.conf.arg(name="")]
     store: str
     """Folder or s3:// URL of the store: new, or of the same setting."""
-    proposer: Literal["random", "aip"] = "random"
-    """Who chooses the interactions."""
+    proposer: str = RANDOM
+    """Who chooses the interactions: random, aip, or another that the package or an installed one has."""
     policy: int | Literal["latest"] = 0
-    """Version of the policy in the store that the proposer uses; "aip" needs one. "latest": always the newest that is
-    published, also by a learner that is at work at the same time (`adaafford learn --follow`)."""
+    """Version of the policy in the store that the proposer uses; "random" needs none, "aip" does. "latest": always the
+    newest that is published, also by a learner that is at work at the same time (`adaafford learn --follow`)."""
     retry_quarantined: tyro.conf.FlagCreatePairsOff[bool] = False
     """Execute the rollouts again that the store holds as quarantined, once what made them fail was mended."""
     config: Path | None = None
@@ -77,8 +78,10 @@ def main(args: list[str]) -> int:
     defaults = CollectCommand(layered(CollectSettings, None, config), tyro.MISSING, config=config)
     command = parse_flags(CollectCommand, args, "collect", defaults)
     task = command.settings.task_record
-    if (command.proposer == "aip") != (command.policy == "latest" or command.policy > 0):
-        raise UsageError("the proposer 'aip' needs --policy VERSION (1 or more, or latest), and 'random' takes none")
+    learnt = needs_policy(command.proposer)
+    if learnt != (command.policy == "latest" or command.policy > 0):
+        wanted = "needs --policy VERSION (1 or more, or latest)" if learnt else "takes no --policy"
+        raise UsageError(f"the proposer '{command.proposer}' {wanted}")
     if command.settings.per_version is not None and command.policy != "latest":
         raise UsageError("--per-version is about the versions of --policy latest; without that, give --rollouts alone")
     _collect(command, task)

@@ -8,6 +8,7 @@ import tyro
 
 from cluster.evaluation_settings import EvaluateSettings
 from cluster.settings import parse_flags
+from shared.methods import method_named
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,8 @@ def main(args: list[str]) -> int:
     command = parse_flags(EvaluateCommand, args, "evaluate", EvaluateCommand(EvaluateSettings(), tyro.MISSING))
     if command.settings.task is not None:
         _ = command.settings.task_record
+    for method in command.settings.methods:
+        method_named(method)
     from cluster.evaluation_of_run import evaluate_run
 
     evaluate_run(command.run, command.settings, command.out)

@@ -9,6 +9,7 @@ import tyro
 from cluster.configuration import CampaignConfig
 from cluster.settings import early_flags, layered, parse_flags
 from shared.errors import UsageError
+from shared.methods import method_named
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,8 @@ def main(args: list[str]) -> int:
     defaults = RunCommand(layered(CampaignConfig, preset, config), None, preset, config)
     command = parse_flags(RunCommand, args, "run", defaults)
     _ = command.settings.task_record
+    for method in command.settings.evaluation.methods:
+        method_named(method)
     if command.dry_run:
         from cluster.estimate import RATES, estimate
         from cluster.estimate_table import print_estimate
