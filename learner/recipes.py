@@ -244,3 +244,15 @@ def settings_of(settings: LearnerSettings, name: BaselineName) -> TrainingConfig
     training = training_of(name)
     told = getattr(settings, training.table) if training.table else settings.baselines.get(name, {})
     return told if isinstance(told, training.settings) else parse(training.settings, told, f"baselines.{name}")
+
+
+def check_baselines(settings: LearnerSettings) -> None:
+    """Refuse settings of baselines that would be found wrong, or not be found, when these are trained.
+
+    Raises:
+        UsageError: there is no such baseline, or one of its settings is unknown or not allowed.
+    """
+    for name in settings.baselines:
+        if table := training_of(name).table:
+            raise UsageError(f"settings of the baseline '{name}' belong into the table '{table}', not into 'baselines'")
+        settings_of(settings, name)

@@ -6,13 +6,14 @@ range of a plan's rollouts and makes one *shard*. Nothing here knows who does th
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import FailFast, Field, model_validator
 
 from shared.configuration import CollectionConfig, StrictModel
-from shared.methods import MethodName
-from shared.tasks import Task, Terms, task_named
+from shared.extensions import Registry
+from shared.methods import BASELINES, METHODS, PROPOSERS, RANDOM, MethodName
+from shared.tasks import TASKS, Task, Terms, task_named
 
 
 class ObjectRef(StrictModel):
@@ -89,6 +90,17 @@ class Setting(StrictModel):
             UsageError: there is no such task.
         """
         return self.task_record.terms(self.collection)
+
+
+def found_by_name(setting: Setting) -> list[tuple[Registry[Any], str]]:
+    """The task, methods, proposers and baselines that a setting uses, each with the registry that knows it."""
+    used: list[tuple[Registry[Any], str]] = [] if setting.task_definition is not None else [(TASKS, setting.task)]
+    for name in () if setting.evaluation is None else setting.evaluation.methods:
+        method = METHODS.get(name)
+        used.append((METHODS, name))
+        used += [(PROPOSERS, method.tries)] if method.tries is not None and method.tries != RANDOM else []
+        used += [(BASELINES, method.critic)] if method.critic in BASELINES.names() else []
+    return list(dict.fromkeys(used))
 
 
 class Plan(StrictModel):

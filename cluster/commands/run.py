@@ -39,6 +39,10 @@ def main(args: list[str]) -> int:
     _ = command.settings.task_record
     for method in command.settings.evaluation.methods:
         method_named(method)
+    if command.settings.learner.baselines:
+        from learner.recipes import check_baselines
+
+        check_baselines(command.settings.learner)
     if command.dry_run:
         from cluster.estimate import RATES, estimate
         from cluster.estimate_table import print_estimate

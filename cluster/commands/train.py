@@ -68,6 +68,7 @@ def _train(stage: str, command: TrainCommand, memory: "Memory | None") -> None:
     from learner.alternation import alternate
     from learner.data import read_object_list
     from learner.hardware import hardware
+    from learner.recipes import check_baselines
     from learner.stages import StageJob, run_stage
 
     job = StageJob(
@@ -78,6 +79,7 @@ def _train(stage: str, command: TrainCommand, memory: "Memory | None") -> None:
         train_objects=read_object_list(command.train_objects),
         validation_objects=read_object_list(command.validation_objects),
     )
+    check_baselines(command.settings)
     with hardware(command.settings) as used:
         if stage == "alternate":
             alternate(job, command.settings, used)

@@ -1,0 +1,1 @@
+"""What this package adds to adaafford, one module each."""
