@@ -14,9 +14,10 @@ import numpy as np
 from collector.articulation import MIN_RANGE, ArticulatedObject
 from collector.decomposition import Decomposer
 from collector.files import short
-from collector.readers import READERS, read_object, reader_of
+from collector.readers import READERS, ObjectReader, read_object, reader_of
 from shared.configuration import Collision
 from shared.errors import ObjectError, UsageError
+from shared.extensions import Registry
 from shared.files import read_named
 from shared.plan import ObjectRef
 from shared.private import cache_folder
@@ -49,6 +50,8 @@ class CatalogueEntry:
     parts: tuple[PartSummary, ...]
     tree: Path
     """The folder that was scanned, below which links are followed."""
+    reader: str
+    """Which of `collector.readers.READERS` read it."""
     notes: tuple[str, ...] = ()
     """What was left out or read otherwise, one phrase each."""
 
@@ -65,6 +68,10 @@ class Catalogue:
     usable: tuple[CatalogueEntry, ...]
     refused: tuple[tuple[str, str], ...]
     """(id, reason in one line)."""
+
+    def readers(self) -> list[tuple[Registry[ObjectReader], str]]:
+        """The readers of the usable objects, each once, with the registry that knows them."""
+        return [(READERS, name) for name in sorted({entry.reader for entry in self.usable})]
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +234,9 @@ def _object_folders(path: Path) -> dict[str, Path]:
 
 def _entry(folder: Path, tree: Path) -> CatalogueEntry:
     described = read_object(folder, tree)
-    return CatalogueEntry(described.ref, folder, summaries(described), tree, described.notes)
+    return CatalogueEntry(
+        described.ref, folder, summaries(described), tree, reader_of(folder) or READERS.names()[0], described.notes
+    )
 
 
 def _load(folder: Path, tree: Path, ref: ObjectRef) -> ArticulatedObject:

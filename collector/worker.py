@@ -85,6 +85,8 @@ class Worker:
                 records.append(self.execute(plan, index, clock))
         under_way(None)
         provenance = {}
+        if plan.proposer in PROPOSERS.names() and (package := PROPOSERS.package_of(plan.proposer)) is not None:
+            provenance["proposer"] = package
         if plan.policy_version:
             # Beside the version in each row this says how far that was behind, where collection follows a learner.
             provenance["newest_policy"] = str(max(self._store.policy_versions(), default=0))

@@ -57,6 +57,8 @@ def test_the_catalogue_asks_the_reader_of_another_package(tmp_path: Path) -> Non
     (tmp_path / "objects" / "nothing").mkdir()
     catalogue = scan(tmp_path / "objects")
     assert [entry.ref.id for entry in catalogue.usable] == ["large", "small"]
+    assert catalogue.readers() == [(READERS, "lids")]
+    assert READERS.package_of("lids") == "lids 1.0"
     assert [(name, "mobility.urdf" in why) for name, why in catalogue.refused] == [("nothing", True)]
     ref = catalogue.usable[1].ref
     assert load_ref(tmp_path / "objects", ref).ref == scan(tmp_path / "objects" / "small").usable[0].ref == ref
@@ -72,7 +74,7 @@ def test_the_content_hash_covers_the_files_that_were_read(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"size": [30.0, 1.0, 1.0]}, "can be .* from the root's origin"),
+        ({"size": [90.0, 1.0, 1.0]}, "can be .* from the root's origin"),
         ({"size": [float("nan"), 1.0, 1.0]}, "not finite"),
         ({"upper": float("inf")}, "numbers must be finite"),
         ({"upper": 0.0}, "no joint can move"),

@@ -79,6 +79,7 @@ def test_its_task_and_its_proposer_collect(tmp_path: Path) -> None:
     assert proposers == {"furthest", "random"}
     assert found_by_name(store.setting) == [(TASKS, "push-lid")]
     assert TASKS.package_of("push-lid") == "adaafford-example 1.0"
+    assert {store.manifest(job).provenance["proposer"] for job in store.jobs()} == {"adaafford-example 1.0"}
 
 
 def test_a_proposer_without_networks_takes_no_policy(tmp_path: Path) -> None:

@@ -16,10 +16,10 @@ from shared.store import Store
 from shared.tasks import TASKS, Task, read_task, task_of
 from tests.fabricate import fabricate_setting
 
-DRAWER = """
-name = "pull-drawer"
+DOOR = """
+name = "pull-door"
 primitive = "pull"
-part_names = ["drawer"]
+part_names = ["door"]
 closed = true
 edge_share = 0.5
 dynamics.joint_friction = {low = 0.1, high = 5.0, log = true}
@@ -28,9 +28,9 @@ SMALL = "[camera]\nimage_size = 64\npoints = 64\ncandidates = 64\n[rollout]\nint
 
 
 @pytest.fixture
-def drawer(tmp_path: Path) -> Path:
-    file = tmp_path / "drawer.toml"
-    file.write_text(DRAWER)
+def door(tmp_path: Path) -> Path:
+    file = tmp_path / "door.toml"
+    file.write_text(DOOR)
     return file
 
 
@@ -66,19 +66,19 @@ def test_the_mistake_in_a_task_file_is_what_a_command_says(
     assert not (tmp_path / "new").exists()
 
 
-def test_settings_take_up_what_the_file_says(drawer: Path, tmp_path: Path) -> None:
-    settings = CampaignConfig(task=str(drawer))
-    assert settings.task == "pull-drawer"
-    assert settings.task_record == read_task(drawer) == task_of(str(drawer))
+def test_settings_take_up_what_the_file_says(door: Path, tmp_path: Path) -> None:
+    settings = CampaignConfig(task=str(door))
+    assert settings.task == "pull-door"
+    assert settings.task_record == read_task(door) == task_of(str(door))
     document = json.loads(settings.model_dump_json())
-    drawer.unlink()
+    door.unlink()
     assert parse(CampaignConfig, document, "config.json") == settings
     assert parse(CampaignConfig, document | {"task": "push"}, "config.json").task_record == TASKS.get("push")
 
 
-def test_a_file_of_settings_may_name_the_file_of_a_task(drawer: Path, tmp_path: Path) -> None:
-    (tmp_path / "settings.toml").write_text(f"task = '{drawer}'\nrollouts = 3")
-    assert layered(CollectSettings, None, tmp_path / "settings.toml").task_record.part_names == ("drawer",)
+def test_a_file_of_settings_may_name_the_file_of_a_task(door: Path, tmp_path: Path) -> None:
+    (tmp_path / "settings.toml").write_text(f"task = '{door}'\nrollouts = 3")
+    assert layered(CollectSettings, None, tmp_path / "settings.toml").task_record.part_names == ("door",)
 
 
 def test_a_setting_of_a_built_in_task_is_written_as_before() -> None:
@@ -88,7 +88,7 @@ def test_a_setting_of_a_built_in_task_is_written_as_before() -> None:
     assert "task_definition" not in json.loads(CampaignConfig().model_dump_json())
 
 
-def test_a_store_holds_the_task_that_a_file_defined(drawer: Path, tmp_path: Path) -> None:
+def test_a_store_holds_the_task_that_a_file_defined(door: Path, tmp_path: Path) -> None:
     settings = tmp_path / "settings.toml"
     settings.write_text(SMALL.replace("[", "[collection."))
     command = [
@@ -100,18 +100,18 @@ def test_a_store_holds_the_task_that_a_file_defined(drawer: Path, tmp_path: Path
         "--rollouts",
         "1",
         "--task",
-        str(drawer),
+        str(door),
     ]
     command += ["--categories", "StorageFurniture", "--procedural-per-category", "1", "--config", str(settings)]
     assert run(command) == 0
-    task = read_task(drawer)
-    drawer.unlink()
+    task = read_task(door)
+    door.unlink()
     store = Store.open(tmp_path / "store")
-    assert (store.setting.task, store.setting.task_record) == ("pull-drawer", task)
+    assert (store.setting.task, store.setting.task_record) == ("pull-door", task)
     assert store.setting.terms.dynamics.joint_friction.high == 5.0
-    drawer.write_text(DRAWER.replace("5.0", "6.0"))
+    door.write_text(DOOR.replace("5.0", "6.0"))
     with pytest.raises((StoreError, UsageError), match="joint_friction"):
-        Store.create(tmp_path / "store", store.setting.model_copy(update={"task_definition": read_task(drawer)}))
+        Store.create(tmp_path / "store", store.setting.model_copy(update={"task_definition": read_task(door)}))
 
 
 def test_a_setting_names_the_task_that_it_defines() -> None:
