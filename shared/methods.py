@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 MethodName = Name
 BaselineName = Name
 CriticName = Name
-""""where2act", "aap", or a baseline's."""
+"""Of whose beliefs count: where2act, aap, or a baseline."""
 ModuleName = Name
-"""Of a network that a policy may hold: "prior", "aap", "aip", or a baseline's."""
+"""Of a network that a policy may hold: prior, aap, aip, or a baseline."""
 
 RANDOM = "random"
 """The proposer that needs no policy, and that everything is compared with."""
