@@ -31,6 +31,7 @@ from cluster.run_folder import ObjectsUsed, RunFolder
 from cluster.session import FleetMaker, fleets
 from cluster.stages import Stage, run_stages
 from cluster.training import Trainer
+from collector.setting import make_setting, packages_used
 from shared.errors import UsageError
 from shared.files import write_atomically
 from shared.methods import baselines_of
@@ -123,6 +124,7 @@ class Campaign:
         """Decide which objects are trained on and which are kept for the end, and make both stores."""
         run, config = self._run, self._config
         task = config.task_record
+        packages_used(task, config.collection)  # What cannot be found is refused before any object is read.
         per_category = config.procedural.per_category
         built_in, lists = run.generated_objects.resolve(), lists_of(config.splits)
         catalogue, folder = objects_for(task, config, built_in, per_category, config.seed, lists)
@@ -155,13 +157,12 @@ class Campaign:
     def _setting(self, used: ObjectsUsed, *, evaluation: bool) -> Setting:
         config = self._config
         objects = used.test if evaluation else (*used.train, *used.validation)
-        return Setting(
+        return make_setting(
+            config.task_record,
+            config.collection,
             kind="evaluation" if evaluation else "collection",
-            task=config.task,
-            task_definition=config.task_definition,
             seed=config.seed,
             objects=tuple(sorted(objects, key=lambda ref: ref.id)),
-            collection=config.task_record.resolve(config.collection),
             evaluation=config.evaluation if evaluation else None,
         )
 

@@ -21,6 +21,7 @@ from shared.methods import METHODS, RANDOM, BaselineName, baselines_of
 from shared.networks.configuration import NetworkConfig
 from shared.plan import ObjectRef
 from shared.policy import Policy
+from shared.primitives import PRIMITIVES
 from shared.tasks import Task
 from shared.vocabulary import Order
 
@@ -250,7 +251,8 @@ class _Costs:
         return steps * (clouds * self.encode_s + rows * self.rates.trained_row_s)
 
     def _simulation_s(self, rollouts: int, interactions: int, clouds: int) -> float:
-        rates, pulls = self.rates, self.task.terms(self.config.collection).primitive.pulls
+        primitive = PRIMITIVES.get(self.task.terms(self.config.collection).primitive)
+        rates, pulls = self.rates, primitive.closes_fingers
         if self.config.collection.fidelity.name == "reference":
             trial_s = rates.reference_pull_s if pulls else rates.reference_push_s
         else:

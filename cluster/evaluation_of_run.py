@@ -17,6 +17,7 @@ from cluster.objects import objects_for
 from cluster.run_folder import ObjectsUsed, RunFolder, find
 from cluster.session import fleets
 from collector.guard import Limits
+from collector.setting import make_setting
 from shared.errors import UsageError
 from shared.methods import METHODS, MethodName
 from shared.plain import plain
@@ -38,13 +39,12 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
     policy = Policy.from_files(policies.read_policy(version))
     task = _task(config, settings)
     refs, folder = _objects(task, settings, run, used)
-    setting = Setting(
+    setting = make_setting(
+        task,
+        config.collection,
         kind="evaluation",
-        task=task.name,
-        task_definition=(config if settings.task is None else settings).task_definition,
         seed=config.seed if settings.seed is None else settings.seed,
         objects=refs,
-        collection=task.resolve(config.collection),
         evaluation=EvaluationConfig(
             methods=tuple(dict.fromkeys(settings.methods)) or _possible_methods(policy),
             budgets=tuple(sorted(set(settings.budgets))),
@@ -97,10 +97,10 @@ def _task(config: CampaignConfig, settings: EvaluateSettings) -> Task:
     """The task to evaluate on; the networks were trained for one primitive and know no other."""
     trained = config.task_record
     task = trained if settings.task is None else settings.task_record
-    if task.primitive is not trained.primitive:
+    if task.primitive != trained.primitive:
         raise UsageError(
-            f"the run is trained to {trained.primitive.value} (task '{trained.name}'), and task '{task.name}' needs "
-            f"{task.primitive.value}; name a task of the same primitive"
+            f"the run is trained to {trained.primitive} (task '{trained.name}'), and task '{task.name}' needs "
+            f"{task.primitive}; name a task of the same primitive"
         )
     return task
 

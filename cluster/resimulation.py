@@ -10,7 +10,9 @@ import numpy as np
 from collector.catalogue import load_ref
 from collector.primitives import Trial
 from collector.scene import Scene
-from shared.errors import StoreError
+from shared.configuration import SAPIEN
+from shared.errors import StoreError, UsageError
+from shared.primitives import PRIMITIVES
 from shared.records import InteractionRecord, RolloutRecord
 from shared.seeds import generator
 from shared.store import Store
@@ -75,7 +77,10 @@ def resimulate(
     Raises:
         StoreError: the store is damaged, or holds no label.
         ObjectError: an object is missing, or its files are others.
+        UsageError: another simulator made the store.
     """
+    if (simulator := store.setting.collection.simulator) != SAPIEN:
+        raise UsageError(f"{store.where}: made with the simulator '{simulator}'; only SAPIEN executes rows again")
     replayed = []
     for shard, chosen in _chosen(store, rows, seed).items():
         records = {record.index: record for record in store.read_rollouts(shard)}
@@ -103,11 +108,12 @@ def _chosen(store: Store, rows: int, seed: int) -> dict[str, list[tuple[int, int
 def _again(store: Store, objects: Path, record: RolloutRecord, row: InteractionRecord) -> Outcome:
     collection = store.setting.collection
     target = load_ref(objects, record.object, collection.collision)
-    scene = Scene(target, record.dynamics, collection.fidelity, row.primitive)
+    primitive = PRIMITIVES.get(row.primitive)
+    scene = Scene(target, record.dynamics, collection.fidelity, primitive, collection.gripper)
     if record.dynamics.direction is not Direction.AS_BUILT:
         scene.restrict(first_positions(row.joint_limits, record.dynamics.direction))
     scene.put(row.joint_positions)
-    return Trial(scene, row.action, row.target_part, row.primitive, collection.fidelity).run()
+    return Trial(scene, row.action, row.target_part, primitive, collection.fidelity).run()
 
 
 def first_positions(limits: Float, direction: Direction) -> Float:

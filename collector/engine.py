@@ -22,7 +22,7 @@ Link: TypeAlias = physx.PhysxArticulationLinkComponent
 DENSITY = 1000.0
 """SAPIEN's default; only the shape of a link's inertia matters, since its mass is drawn."""
 
-__all__ = ["DENSITY", "Assembly", "Link", "new_scene", "physx", "pose", "sapien", "set_mass"]
+__all__ = ["DENSITY", "Assembly", "Link", "convex_shapes", "new_scene", "physx", "pose", "sapien", "set_mass"]
 
 
 def new_scene(solver_iterations: int) -> tuple[sapien.Scene, physx.PhysxCpuSystem]:
@@ -130,6 +130,14 @@ def _convex_shape(mesh: Mesh, material: physx.PhysxMaterial) -> physx.PhysxColli
         return None
     shape.set_density(DENSITY)
     return shape
+
+
+def convex_shapes(link: Link) -> tuple[Mesh, ...]:
+    """What a link collides as: the vertices of its convex pieces, in its frame."""
+    return tuple(
+        Mesh(np.asarray(shape.vertices, dtype=np.float64), np.zeros((0, 3), dtype=np.int32))
+        for shape in link.collision_shapes
+    )
 
 
 def set_mass(link: Link, mass: float) -> None:

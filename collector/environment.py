@@ -4,16 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from collector.articulation import ArticulatedObject
+from collector.articulation import ArticulatedObject, joint_twist
 from collector.camera import Camera, EmbreeCamera, observation_from
 from collector.catalogue import qualifying_parts
 from collector.clock import StageClock
 from collector.primitives import Trial
 from collector.sapien_camera import SapienCamera
 from collector.scene import Scene
-from shared.configuration import CameraConfig, Fidelity
+from collector.simulator import PrivilegedState, SimEnvironment
+from shared.configuration import CameraConfig, CollectionConfig
+from shared.errors import UsageError
+from shared.primitives import PRIMITIVES
 from shared.tasks import Task
-from shared.vocabulary import Action, Direction, Float, HiddenDynamics, Observation, Outcome, Primitive
+from shared.vocabulary import Action, Direction, Float, HiddenDynamics, Observation, Outcome
 
 SETTLE_STEPS, SETTLE_MOST = 60, 480
 """At 1/240 s: still for a quarter of a second, within two seconds. AdaAfford: 150 of at most 200 steps of 1/500 s."""
@@ -24,7 +27,7 @@ CLOSED_SHARE = 0.5
 
 
 class SapienEnvironment:
-    """Implements `shared.vocabulary.Environment` with SAPIEN's physics and a depth camera.
+    """Implements `collector.simulator.SimEnvironment` with SAPIEN's physics and a depth camera.
 
     All tries of a rollout are on one part, for what they are to find out is how this door or that switch moves: of the
     parts that the first observation shows and the task allows, one is drawn in proportion to its visible points.
@@ -32,11 +35,9 @@ class SapienEnvironment:
     Args:
         target: the object.
         task: which parts count, and from which states.
-        primitive: what `execute` executes.
+        collection: primitive, gripper, fidelity and camera.
         dynamics: the hidden draw.
         world_from_camera: [4, 4].
-        camera: what the camera keeps.
-        fidelity: how finely trials are simulated.
         rng: draws which of the hit pixels become candidates for the cloud, and which part is the target.
         clock: sums wall time by stage ("load", "settle", "observe", "simulate").
     """
@@ -45,23 +46,21 @@ class SapienEnvironment:
         self,
         target: ArticulatedObject,
         task: Task,
-        primitive: Primitive,
+        collection: CollectionConfig,
         dynamics: HiddenDynamics,
         world_from_camera: Float,
-        camera: CameraConfig,
-        fidelity: Fidelity,
         rng: np.random.Generator,
         clock: StageClock,
     ) -> None:
         self.object = target
         self.task = task
-        self.primitive = primitive
+        self.primitive = task.terms(collection).primitive
         self.parts = qualifying_parts(target, task)
+        self._spec, self._fidelity = PRIMITIVES.get(self.primitive), collection.fidelity
         with clock.stage("load"):
-            self.scene = Scene(target, dynamics, fidelity, primitive)
-        self._camera = camera_for(target, world_from_camera, camera)
-        self._camera_config = camera
-        self._fidelity = fidelity
+            self.scene = Scene(target, dynamics, self._fidelity, self._spec, collection.gripper)
+        self._camera_config = collection.camera
+        self._camera = camera_for(target, world_from_camera, self._camera_config)
         self._rng = rng
         self._observed: Observation | None = None
         self._known: list[tuple[Float, Observation]] = []
@@ -113,7 +112,7 @@ class SapienEnvironment:
         part = int(self._observed.part_ids[action.point_index])
         self._disturbed = True
         with self._clock.stage("simulate"):
-            return Trial(self.scene, action, part, self.primitive, self._fidelity).run()
+            return Trial(self.scene, action, part, self._spec, self._fidelity).run()
 
     def state(self) -> Float:
         """The joint positions, [parts], which `restore` puts back."""
@@ -123,6 +122,13 @@ class SapienEnvironment:
         """Put a state back, at rest."""
         self.scene.put(state)
         self._disturbed = False
+
+    def privileged(self, part: int) -> PrivilegedState:
+        """See `SimEnvironment.privileged`."""
+        joint = self.object.bodies[part].joint
+        assert joint is not None
+        twist = joint_twist(joint, self.scene.body_pose(part))
+        return PrivilegedState(self.scene.joint_positions(), self.scene.limits.copy(), twist)
 
     def _look(self, positions: Float) -> Observation:
         image = self._camera.capture(positions)
@@ -140,6 +146,17 @@ class SapienEnvironment:
         self._disturbed = False
         with self._clock.stage("settle"):
             return self.scene.settle(round(SETTLE_STEPS * rate), round(SETTLE_MOST * rate))
+
+
+def only_sapien(environment: SimEnvironment) -> SapienEnvironment:
+    """The environment, for what looks into SAPIEN's scene.
+
+    Raises:
+        UsageError: it is of another simulator.
+    """
+    if not isinstance(environment, SapienEnvironment):
+        raise UsageError("this measures SAPIEN's physics; leave collection.simulator at 'sapien'")
+    return environment
 
 
 def camera_for(target: ArticulatedObject, world_from_camera: Float, config: CameraConfig) -> Camera:

@@ -12,18 +12,20 @@ from scipy.spatial import ConvexHull
 from collector.articulation import ArticulatedObject, Body, Joint, Mesh
 from collector.camera import DepthImage, EmbreeCamera
 from collector.clock import StageClock
+from collector.engine import Link, convex_shapes
 from collector.environment import SapienEnvironment
-from collector.gripper import finger, palm
+from collector.grippers import GRIPPERS
 from collector.preview import part_colours, save, shaded
 from collector.primitives import Trial
 from collector.proposers import RandomProposer
 from collector.scene import Scene
 from shared import seeds
-from shared.configuration import CameraConfig, Fidelity
+from shared.configuration import PANDA, CameraConfig, CollectionConfig, Fidelity
 from shared.errors import UsageError
 from shared.geometry import camera_pose
+from shared.primitives import PRIMITIVES
 from shared.tasks import task_named
-from shared.vocabulary import Action, Float, HiddenDynamics, Outcome, Primitive
+from shared.vocabulary import Action, Float, HiddenDynamics, Outcome
 
 FIDELITY = Fidelity(name="film", skip_free_flight=False)
 DYNAMICS = HiddenDynamics(part_mass=0.2, joint_friction=0.3, surface_friction=2.0)
@@ -47,7 +49,7 @@ class Pose:
 
     Attributes:
         joint_positions: [parts], of the object.
-        hand: [3, 4, 4], world_from_link of the palm and both fingers.
+        hand: [links, 4, 4], world_from_link of the palm and the fingers.
     """
 
     joint_positions: Float
@@ -56,11 +58,12 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Take:
-    """One filmed trial; `contact` is None where the hand touched nothing."""
+    """One filmed trial; `contact` is None where the hand touched nothing, `hand` are the shapes of its links."""
 
     action: Action
-    primitive: Primitive
+    primitive: str
     outcome: Outcome
+    hand: tuple[tuple[Mesh, ...], ...]
     start: Pose
     contact: Pose | None
     end: Pose
@@ -76,14 +79,15 @@ class Take:
     def caption(self) -> str:
         """What came of it, in a few words."""
         success = "success" if self.outcome.success else "failure"
-        return f"{self.primitive.value}: {self.outcome.kind.value}, {success}, m = {self.outcome.motion:.3f}"
+        return f"{self.primitive}: {self.outcome.kind.value}, {success}, m = {self.outcome.motion:.3f}"
 
 
 class FilmedTrial(Trial):
     """A trial that remembers where everything was at its moments."""
 
-    def __init__(self, scene: Scene, action: Action, target: int, primitive: Primitive) -> None:
-        super().__init__(scene, action, target, primitive, FIDELITY)
+    def __init__(self, scene: Scene, action: Action, target: int, primitive: str) -> None:
+        super().__init__(scene, action, target, PRIMITIVES.get(primitive), FIDELITY)
+        self._name = primitive
         self._first: Pose | None = None
         self._contact: Pose | None = None
         self._last: Pose | None = None
@@ -92,7 +96,8 @@ class FilmedTrial(Trial):
         """Execute the trial."""
         outcome = self.run()
         assert self._first is not None and self._last is not None, "a trial takes at least one step"
-        return Take(self.action, self.primitive, outcome, self._first, self._contact, self._last)
+        hand = tuple(convex_shapes(link) for link in _links(self.scene))
+        return Take(self.action, self._name, outcome, hand, self._first, self._contact, self._last)
 
     def _step(self) -> None:
         try:
@@ -104,7 +109,9 @@ class FilmedTrial(Trial):
                 self._contact = self._last
 
 
-def film(target: ArticulatedObject, primitives: Sequence[Primitive], seed: int, out_png: Path) -> list[str]:
+def film(
+    target: ArticulatedObject, primitives: Sequence[str], seed: int, out_png: Path, gripper: str = PANDA
+) -> list[str]:
     """Write a picture of one trial of each primitive, a random one that succeeds wherever one is found.
 
     Args:
@@ -112,14 +119,19 @@ def film(target: ArticulatedObject, primitives: Sequence[Primitive], seed: int, 
         primitives: what to show, in this order.
         seed: of the random trials.
         out_png: file to write.
+        gripper: the name of the hand.
 
     Returns:
         The caption of each trial.
 
     Raises:
-        UsageError: no camera sees a part that moves, or the file cannot be written.
+        UsageError: something is not found by its name, no camera sees a part that moves, or the file cannot be
+            written.
     """
-    takes = [_best_take(target, primitive, seed) for primitive in primitives]
+    GRIPPERS.get(gripper)
+    for primitive in primitives:
+        PRIMITIVES.get(primitive)
+    takes = [_best_take(target, primitive, gripper, seed) for primitive in primitives]
     across = 1 if len(takes) < 4 else 2
     rows = int(np.ceil(len(takes) / across))
     figure = Figure(figsize=(across * 3 * 2.2, rows * 2.5), dpi=CLOSE_UP.image_size / 2.2)
@@ -139,10 +151,10 @@ def film(target: ArticulatedObject, primitives: Sequence[Primitive], seed: int, 
     return [take.caption for take in takes]
 
 
-def _best_take(target: ArticulatedObject, primitive: Primitive, seed: int) -> Take:
+def _best_take(target: ArticulatedObject, primitive: str, gripper: str, seed: int) -> Take:
     """Of a few random successes the one that takes the touched point the farthest; without any, the last failure."""
     successes, failure = list[Take](), None
-    for take in _takes(target, primitive, seed):
+    for take in _takes(target, primitive, gripper, seed):
         if not take.outcome.success:
             failure = take
             continue
@@ -156,14 +168,15 @@ def _best_take(target: ArticulatedObject, primitive: Primitive, seed: int) -> Ta
     return failure
 
 
-def _takes(target: ArticulatedObject, primitive: Primitive, seed: int) -> Iterator[Take]:
+def _takes(target: ArticulatedObject, primitive: str, gripper: str, seed: int) -> Iterator[Take]:
     """Random trials from random states."""
     pixels, states, actions = (
-        seeds.generator(seed, f"film/{purpose}/{primitive.value}", 0) for purpose in ("pixels", "states", "actions")
+        seeds.generator(seed, f"film/{purpose}/{primitive}", 0) for purpose in ("pixels", "states", "actions")
     )
-    camera, task = CameraConfig(), task_named("pull" if primitive.pulls else "push")
-    pose = camera_pose(*SEEN_FROM, camera.distance)
-    environment = SapienEnvironment(target, task, primitive, DYNAMICS, pose, camera, FIDELITY, pixels, StageClock())
+    collection = CollectionConfig(primitive=primitive, gripper=gripper, fidelity=FIDELITY)
+    task = task_named("pull" if PRIMITIVES.get(primitive).closes_fingers else "push")
+    pose = camera_pose(*SEEN_FROM, collection.camera.distance)
+    environment = SapienEnvironment(target, task, collection, DYNAMICS, pose, pixels, StageClock())
     proposer = RandomProposer(actions, EDGE_SHARE)
     for _ in range(STATES):
         if not (environment.reset(states) and environment.shows_a_target()):
@@ -178,37 +191,39 @@ def _takes(target: ArticulatedObject, primitive: Primitive, seed: int) -> Iterat
             ).take()
 
 
+def _links(scene: Scene) -> tuple[Link, ...]:
+    return (scene.gripper.palm, *scene.gripper.fingers)
+
+
 def _pose_of(scene: Scene) -> Pose:
-    links = (scene.gripper.palm, *scene.gripper.fingers)
-    hand = [np.asarray(link.entity_pose.to_transformation_matrix(), dtype=np.float64) for link in links]
+    hand = [np.asarray(link.entity_pose.to_transformation_matrix(), dtype=np.float64) for link in _links(scene)]
     return Pose(scene.joint_positions(), np.stack(hand))
 
 
 def _pictures(target: ArticulatedObject, take: Take) -> list[Float]:
     """The moments from the side that shows more of the hand, the camera on the touched point."""
-    shots = [[_capture(target, take.action, pose, side) for pose in take.moments.values()] for side in SIDES_DEG]
+    shots = [[_capture(target, take, pose, side) for pose in take.moments.values()] for side in SIDES_DEG]
     best = max(shots, key=lambda images: sum(int((i.bodies > len(target.parts)).sum()) for i in images))
-    colours = np.concatenate([part_colours(len(target.parts)), [PALM_COLOUR, FINGER_COLOUR, FINGER_COLOUR]])
+    fingers = [FINGER_COLOUR] * (len(take.hand) - 1)
+    colours = np.concatenate([part_colours(len(target.parts)), [PALM_COLOUR, *fingers]])
     return [shaded(image, colours, CLOSE_UP.image_size) for image in best]
 
 
-def _capture(target: ArticulatedObject, action: Action, pose: Pose, side_deg: float) -> DepthImage:
-    behind = -action.approach
+def _capture(target: ArticulatedObject, take: Take, pose: Pose, side_deg: float) -> DepthImage:
+    behind = -take.action.approach
     level = float(np.hypot(behind[0], behind[1]))
     azimuth = np.rad2deg(np.arctan2(behind[1], behind[0])) if level > 0.3 else 180.0
     camera = camera_pose(float(azimuth) + side_deg, 25.0, CLOSE_UP.distance)
-    camera[:3, 3] += action.point
-    with_hand = ArticulatedObject(target.ref, (*target.bodies, *_hand_bodies(pose.hand)))
-    return EmbreeCamera(with_hand, camera, CLOSE_UP).capture(np.append(pose.joint_positions, np.zeros(3)))
+    camera[:3, 3] += take.action.point
+    hand = [_standing(shapes, place) for shapes, place in zip(take.hand, pose.hand, strict=True)]
+    with_hand = ArticulatedObject(target.ref, (*target.bodies, *hand))
+    return EmbreeCamera(with_hand, camera, CLOSE_UP).capture(np.append(pose.joint_positions, np.zeros(len(hand))))
 
 
-def _hand_bodies(hand: Float) -> list[Body]:
-    """The palm and the fingers as bodies that stand where `hand`, [3, 4, 4], has them at joint position 0."""
-    shapes = [_closed(mesh) for mesh in (palm(), finger(), finger())]
-    joints = [
-        Joint("", "prismatic", 0, world_from_link, np.array([1.0, 0.0, 0.0]), 0.0, 0.0) for world_from_link in hand
-    ]
-    return [Body("", "hand", joint, (shape,), ()) for joint, shape in zip(joints, shapes, strict=True)]
+def _standing(shapes: Sequence[Mesh], world_from_link: Float) -> Body:
+    """A link of the hand as a body that stands where it is at joint position 0."""
+    joint = Joint("", "prismatic", 0, world_from_link, np.array([1.0, 0.0, 0.0]), 0.0, 0.0)
+    return Body("", "hand", joint, tuple(_closed(mesh) for mesh in shapes), ())
 
 
 def _closed(mesh: Mesh) -> Mesh:

@@ -1,10 +1,15 @@
-"""The flying Franka Panda hand: its collision shapes and drives (figures of the published protocol).
+"""The flying hand: what a trial needs of one, and hands with two fingers (figures of the published protocol).
 
-The hand frame's columns are forward, left, up, where *up* is the approach direction. There are two ways to make it fly:
-the free one here, whose palm floats and is driven in all six directions at once, and the published one in
+The hand frame's columns are forward, left, up, where *up* is the approach direction. Every hand ends `TIP_DISTANCE`
+ahead of its frame's origin when closed, so that primitives mean the same for all of them. There are two ways to make a
+hand fly: the free one here, whose palm floats and is driven in all six directions at once, and the published one in
 `collector.jointed_gripper`, whose palm hangs on six joints and which costs the engine twice as much a step.
+
+Where the hand is, [4], counts from where it was placed: forward, left, up (m) and its turn about up (rad).
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -13,14 +18,12 @@ from collector.articulation import Mesh
 from collector.engine import Assembly, Link, physx, pose, sapien
 from shared.vocabulary import Float
 
-FINGER_OFFSET = 0.0584
-"""From the hand frame to a finger's, along the approach."""
-FINGER_OPEN = 0.04
-"""How far each finger opens."""
+TIP_DISTANCE = 0.1124
+"""From the hand frame's origin to the end of the hand, along the approach, m."""
+GRASP_OPENING = 0.01
+"""Fingers that together stay open by no more than this hold nothing, m."""
 ARM_STIFFNESS, ARM_DAMPING = 1000.0, 400.0
 FINGER_STIFFNESS, FINGER_DAMPING = 200.0, 60.0
-HAND_MASS, FINGER_MASS = 0.73, 0.015
-"""kg. The drives are strongly overdamped, so these hardly matter."""
 ALONG = {
     "x": np.eye(3),
     "y": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
@@ -28,14 +31,17 @@ ALONG = {
 }
 """Rotations whose first column is the named axis, since SAPIEN's joints move along or about their frame's x."""
 
-_NO_FACES = np.zeros((0, 3), dtype=np.int32)
-
 
 class Gripper(Protocol):
-    """The hand in a scene, however it flies."""
+    """A hand in a scene, however it flies.
+
+    Attributes:
+        palm: the link whose contact ends a trial where the first-contact rule holds.
+        fingers: the other links that touch, whose contact is what a primitive wants.
+    """
 
     palm: Link
-    fingers: tuple[Link, Link]
+    fingers: tuple[Link, ...]
 
     def set_pace(self, pace: float) -> None:
         """Prepare for moving `pace` times faster than published.
@@ -45,43 +51,64 @@ class Gripper(Protocol):
         """
         ...
 
-    def place(self, rotation: Float, position: Float, opening: float) -> None:
-        """Put the hand somewhere at rest, each finger open by `opening`, with the drives holding it there.
+    def place(self, rotation: Float, position: Float, *, opened: bool) -> None:
+        """Put the hand somewhere at rest, holding nothing, with the drives keeping it there.
 
         Args:
             rotation: [3, 3], world_from_hand.
-            position: [3], world, of the hand frame's origin; displacements count from here.
-            opening: of each finger.
+            position: [3], world, of the hand frame's origin.
+            opened: whether the fingers are open.
         """
         ...
 
-    def shift(self, displacement: Float, velocity: Float) -> None:
-        """Put the hand at `displacement`, [3], from where it was placed, hand frame, moving at `velocity`, [3]."""
+    def shift(self, place: Float, velocity: Float) -> None:
+        """Put the hand at `place`, [4], moving at `velocity`, [4]."""
         ...
 
     def displacement(self) -> Float:
-        """Where the hand is, [3], from where it was placed, hand frame."""
+        """Where the hand is, [3], from where it was placed, hand frame, without its turn."""
         ...
 
-    def drive(self, displacement: Float) -> None:
-        """Drive the hand to `displacement`, [3], from where it was placed, hand frame."""
+    def drive(self, place: Float) -> None:
+        """Drive the hand to `place`, [4]."""
         ...
 
     def drive_velocity(self, velocity: Float) -> None:
-        """Let the drives aim at `velocity`, [3], hand frame, as well."""
+        """Let the drives aim at `velocity`, [4], as well."""
         ...
 
-    def drive_fingers(self, opening: float) -> None:
-        """Drive each finger to `opening`."""
+    def close(self) -> None:
+        """Close the fingers, or do what else makes this hand hold on to what it touches."""
         ...
 
     def opening(self) -> float:
-        """How far both fingers together are open."""
+        """How far all fingers together are open, m; what rows keep as `grasp_opening`."""
+        ...
+
+    def holds(self) -> bool:
+        """Whether the hand, told to close, may be holding something."""
         ...
 
     def coordinates(self) -> Float:
         """Everything that moves in the hand, lengths and rad or less: if none of it changes, the hand is at rest."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class GripperSpec:
+    """One kind of hand.
+
+    Attributes:
+        build: builds it into a scene, out of a material, jointed (see `Fidelity.jointed_hand`) or free; a hand that
+            flies in one way alone may ignore that. Its drives need no strength until `Gripper.set_pace`.
+    """
+
+    build: Callable[[sapien.Scene, physx.PhysxMaterial, bool], Gripper]
+
+
+def still() -> Float:
+    """A place or a velocity, [4], of zeros."""
+    return np.zeros(4)
 
 
 def frame(rotation: Float, origin: Float | tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Float:
@@ -91,44 +118,64 @@ def frame(rotation: Float, origin: Float | tuple[float, float, float] = (0.0, 0.
     return matrix
 
 
-def _corners(x: float, y_low: float, y_high: float, z: float) -> list[tuple[float, float, float]]:
-    """The corners of a rectangle at height z that is symmetric in x."""
-    return [(s * x, y, z) for s in (-1.0, 1.0) for y in (y_low, y_high)]
+def convex(vertices: list[tuple[float, float, float]]) -> Mesh:
+    """The convex hull of some vertices, as collision shapes take it."""
+    return Mesh(np.array(vertices), np.zeros((0, 3), dtype=np.int32))
 
 
-def palm() -> Mesh:
-    """The convex palm, hand frame. Its flange, below z = 0, is round with the radius of the wrist."""
-    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    flange = [(0.0316 * np.cos(a), 0.0316 * np.sin(a), -0.026) for a in angles]
-    body = [corner for z in (0.0, 0.03) for corner in _corners(0.032, -0.104, 0.100, z)]
-    top = [corner for z in (0.06, 0.066) for corner in _corners(0.019, -0.104, 0.100, z)]
-    return Mesh(np.array(flange + body + top), _NO_FACES)
+@dataclass(frozen=True, slots=True)
+class TwoFingers:
+    """The shapes and figures of a hand with two fingers that slide apart along its frame's left.
 
+    Attributes:
+        palm: convex pieces, hand frame.
+        finger: convex pieces of the finger that opens towards +y, in its own frame; its pad is at y = 0.
+        finger_offset: m, from the hand frame's origin to a finger's, along the approach.
+        finger_open: m, how far each finger opens.
+        palm_mass: kg. The drives are strongly overdamped, so that masses hardly matter.
+        finger_mass: kg.
+    """
 
-def finger() -> Mesh:
-    """The convex finger that opens towards +y, in its own frame; its pad is at y = 0."""
-    return Mesh(
-        np.array(
-            _corners(0.0104, 0.0025, 0.026, 0.0)
-            + _corners(0.0104, 0.015, 0.026, 0.019)
-            + _corners(0.0087, 0.0, 0.014, 0.036)
-            + _corners(0.0087, 0.0, 0.014, 0.051)
-            + _corners(0.0055, 0.0, 0.014, 0.054)
-        ),
-        _NO_FACES,
-    )
+    palm: tuple[Mesh, ...]
+    finger: tuple[Mesh, ...]
+    finger_offset: float
+    finger_open: float
+    palm_mass: float
+    finger_mass: float
+
+    def add_fingers(self, assembly: Assembly, hand: Link) -> tuple[Link, Link]:
+        """Hang the fingers on the palm's link; their drives have no strength until `set_finger_pace`."""
+        left, right = (self._add_finger(assembly, hand, *named) for named in (("left", 1.0), ("right", -1.0)))
+        return left, right
+
+    def _add_finger(self, assembly: Assembly, hand: Link, name: str, side: float) -> Link:
+        link = assembly.add(
+            hand,
+            f"finger-{name}",
+            self.finger,
+            joint="prismatic",
+            joint_name=f"finger-{name}",
+            parent_from_joint=frame(np.diag([side, side, 1.0]), (0.0, 0.0, self.finger_offset)) @ frame(ALONG["y"]),
+            child_from_joint=frame(ALONG["y"]),
+            limits=(0.0, self.finger_open),
+            touches_own_kind=False,
+        )
+        make_weightless(link, self.finger_mass)
+        return link
 
 
 class FreeGripper:
     """A hand whose palm floats freely, drawn to its target by one drive with six degrees of freedom.
 
     Args:
+        shape: of the hand.
         palm: the palm's link, root of an articulation.
         fingers: the two fingers' links.
     """
 
-    def __init__(self, palm: Link, fingers: tuple[Link, Link]) -> None:
+    def __init__(self, shape: TwoFingers, palm: Link, fingers: tuple[Link, Link]) -> None:
         self.palm, self.fingers = palm, fingers
+        self._open = shape.finger_open
         self._articulation = palm.articulation
         self._drive = physx.PhysxDriveComponent(palm)
         palm.entity.add_component(self._drive)
@@ -145,43 +192,49 @@ class FreeGripper:
             set_property(ARM_STIFFNESS, ARM_DAMPING / pace)
         set_finger_pace(self.fingers, pace)
 
-    def place(self, rotation: Float, position: Float, opening: float) -> None:
+    def place(self, rotation: Float, position: Float, *, opened: bool) -> None:
         """See `Gripper.place`."""
+        opening = self._open if opened else 0.0
         self._rotation, self._origin = rotation, position
         self._drive.pose_in_parent = pose(frame(rotation, position))
-        self.drive(np.zeros(3))
-        self.drive_velocity(np.zeros(3))
+        self.drive(still())
+        self.drive_velocity(still())
         self._articulation.set_qpos(np.full(2, opening, dtype=np.float32))
-        self.drive_fingers(opening)
-        self.shift(np.zeros(3), np.zeros(3))
+        drive_fingers(self.fingers, opening)
+        self.shift(still(), still())
 
-    def shift(self, displacement: Float, velocity: Float) -> None:
+    def shift(self, place: Float, velocity: Float) -> None:
         """See `Gripper.shift`."""
-        self._articulation.set_root_pose(pose(frame(self._rotation, self._origin + self._rotation @ displacement)))
-        self._articulation.set_root_linear_velocity(self._rotation @ velocity)
-        self._articulation.set_root_angular_velocity(np.zeros(3))
+        turned = self._rotation @ _turn(place[3])
+        self._articulation.set_root_pose(pose(frame(turned, self._origin + self._rotation @ place[:3])))
+        self._articulation.set_root_linear_velocity(self._rotation @ velocity[:3])
+        self._articulation.set_root_angular_velocity(self._rotation[:, 2] * velocity[3])
         self._articulation.set_qvel(np.zeros(2, dtype=np.float32))
 
     def displacement(self) -> Float:
         """See `Gripper.displacement`."""
         return np.asarray((self._articulation.get_root_pose().p - self._origin) @ self._rotation, dtype=np.float64)
 
-    def drive(self, displacement: Float) -> None:
+    def drive(self, place: Float) -> None:
         """See `Gripper.drive`."""
-        self._drive.set_drive_target(sapien.Pose(displacement))
+        half = place[3] / 2
+        self._drive.set_drive_target(sapien.Pose(place[:3], [np.cos(half), 0.0, 0.0, np.sin(half)]))
 
     def drive_velocity(self, velocity: Float) -> None:
         """See `Gripper.drive_velocity`."""
-        self._drive.set_drive_velocity_target(velocity, np.zeros(3))
+        self._drive.set_drive_velocity_target(velocity[:3], [0.0, 0.0, velocity[3]])
 
-    def drive_fingers(self, opening: float) -> None:
-        """See `Gripper.drive_fingers`."""
-        for finger_link in self.fingers:
-            finger_link.joint.set_drive_target(opening)
+    def close(self) -> None:
+        """See `Gripper.close`."""
+        drive_fingers(self.fingers, 0.0)
 
     def opening(self) -> float:
         """See `Gripper.opening`."""
         return float(self._articulation.get_qpos().sum())
+
+    def holds(self) -> bool:
+        """See `Gripper.holds`."""
+        return self.opening() > GRASP_OPENING
 
     def coordinates(self) -> Float:
         """See `Gripper.coordinates`: palm position, its quaternion, the fingers."""
@@ -189,45 +242,32 @@ class FreeGripper:
         return np.concatenate([at.p, at.q, self._articulation.get_qpos()])
 
 
-def add_gripper(scene: sapien.Scene, material: physx.PhysxMaterial) -> FreeGripper:
-    """Build the free hand into a scene, weightless, as the published gravity compensation makes it.
+def _turn(angle: float) -> Float:
+    """The rotation [3, 3] about up."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
-    Its drives have no strength until `set_pace`.
-    """
+
+def build_free(shape: TwoFingers, scene: sapien.Scene, material: physx.PhysxMaterial) -> FreeGripper:
+    """Build a free hand into a scene, weightless, as the published gravity compensation makes it."""
     assembly = Assembly(material)
-    hand = assembly.add(None, "palm", (palm(),), joint="undefined", touches_own_kind=False)
-    fingers = add_fingers(assembly, hand)
-    make_weightless(hand, HAND_MASS)
+    hand = assembly.add(None, "palm", shape.palm, joint="undefined", touches_own_kind=False)
+    fingers = shape.add_fingers(assembly, hand)
+    make_weightless(hand, shape.palm_mass)
     assembly.finish(scene)
-    return FreeGripper(hand, fingers)
-
-
-def add_fingers(assembly: Assembly, hand: Link) -> tuple[Link, Link]:
-    """Hang the two fingers on the palm's link `hand`; their drives have no strength until `set_finger_pace`."""
-    left, right = (_add_finger(assembly, hand, *named) for named in (("left", 1.0), ("right", -1.0)))
-    return left, right
-
-
-def _add_finger(assembly: Assembly, hand: Link, name: str, side: float) -> Link:
-    link = assembly.add(
-        hand,
-        f"finger-{name}",
-        (finger(),),
-        joint="prismatic",
-        joint_name=f"finger-{name}",
-        parent_from_joint=frame(np.diag([side, side, 1.0]), (0.0, 0.0, FINGER_OFFSET)) @ frame(ALONG["y"]),
-        child_from_joint=frame(ALONG["y"]),
-        limits=(0.0, FINGER_OPEN),
-        touches_own_kind=False,
-    )
-    make_weightless(link, FINGER_MASS)
-    return link
+    return FreeGripper(shape, hand, fingers)
 
 
 def set_finger_pace(fingers: tuple[Link, Link], pace: float) -> None:
     """See `Gripper.set_pace`."""
     for link in fingers:
         link.joint.set_drive_property(FINGER_STIFFNESS, FINGER_DAMPING / pace)
+
+
+def drive_fingers(fingers: tuple[Link, Link], opening: float) -> None:
+    """Drive each finger to `opening`."""
+    for link in fingers:
+        link.joint.set_drive_target(opening)
 
 
 def make_weightless(link: Link, mass: float) -> None:

@@ -1,25 +1,13 @@
-"""The six gripper primitives: trajectories, the first-contact rule and the success rule (published protocol).
-
-Every primitive is a pure translation of the hand from p - 0.15 d, where d is the approach direction.
-"""
-
-from dataclasses import dataclass
+"""The execution of a primitive: its legs, the first-contact rule and the success rule (published protocol)."""
 
 import numpy as np
 
-from collector.gripper import FINGER_OPEN
+from collector.gripper import still
 from collector.scene import Scene
 from shared.configuration import Fidelity
-from shared.vocabulary import Action, Float, Outcome, OutcomeKind, Primitive
+from shared.primitives import START_DISTANCE, Leg, PrimitiveSpec, hand_start
+from shared.vocabulary import Action, Float, Outcome, OutcomeKind
 
-START_DISTANCE = 0.15
-"""From the hand frame's origin to p at the start, along the approach."""
-REACH_DISTANCE = {Primitive.PUSH_LEFT: 0.11, Primitive.PUSH_UP: 0.11}
-"""Likewise after the approach; 0.10 where not named."""
-SLIDE = 0.05
-"""How far the second leg of the sideways primitives goes."""
-GRASP_OPENING = 0.01
-"""Fingers that together stay open by no more than this hold nothing."""
 MOTION_THRESHOLD = 0.01
 """tau: rad or length."""
 MOTION_SHARE = 0.5
@@ -37,35 +25,10 @@ SANE_POSITION = 1e3
 """A joint position beyond this means that the simulation diverged."""
 
 
-@dataclass(frozen=True, slots=True)
-class Trajectory:
-    """Hand displacements from its start, in the hand frame, at the end of each leg.
-
-    Attributes:
-        approach: [3], where the first leg ends.
-        then: [3], where the second leg ends, or None.
-        intended: [3], direction in which the touched point should move, or None for any.
-    """
-
-    approach: Float
-    then: Float | None
-    intended: Float | None
-
-
-def trajectory(primitive: Primitive) -> Trajectory:
-    """The published trajectory of a primitive; hand frame: forward, left, up."""
-    approach = np.array([0.0, 0.0, START_DISTANCE - REACH_DISTANCE.get(primitive, 0.10)])
-    if primitive is Primitive.PUSH:
-        return Trajectory(approach, None, None)
-    if primitive is Primitive.PULL:
-        return Trajectory(approach, np.zeros(3), np.array([0.0, 0.0, -1.0]))
-    sideways = np.array([1.0, 0.0, 0.0] if primitive.value.endswith("left") else [0.0, 1.0, 0.0])
-    return Trajectory(approach, approach + SLIDE * sideways, sideways)
-
-
-def hand_start(action: Action) -> Float:
-    """Where the hand frame's origin starts, [3], world."""
-    return action.point - START_DISTANCE * action.approach
+def hand_pose(leg: Leg) -> Float:
+    """Where a leg ends, [4], as `collector.gripper.Gripper` counts it."""
+    forward, left, up = leg.end
+    return np.array([forward, left, START_DISTANCE + up, leg.turn_rad])
 
 
 class _TrialEndedError(Exception):
@@ -87,7 +50,7 @@ class Trial:
         fidelity: how finely.
     """
 
-    def __init__(self, scene: Scene, action: Action, target: int, primitive: Primitive, fidelity: Fidelity) -> None:
+    def __init__(self, scene: Scene, action: Action, target: int, primitive: PrimitiveSpec, fidelity: Fidelity) -> None:
         self.scene = scene
         self.action = action
         self.target = target
@@ -99,7 +62,7 @@ class Trial:
         self._timing = fidelity.approach
         self._clearance = 0.0
         self._positions = np.full(1, np.nan)
-        self._hand_at = np.zeros(3)
+        self._hand_at = still()
         self._opening = float("nan")
 
     def run(self) -> Outcome:
@@ -109,7 +72,7 @@ class Trial:
         start = before[self.target - 1]
         body_from_world = np.linalg.inv(scene.body_pose(self.target))
         local = body_from_world @ np.append(self.action.point, 1.0)
-        scene.gripper.place(self.action.rotation, hand_start(self.action), FINGER_OPEN * self.primitive.pulls)
+        scene.gripper.place(self.action.rotation, hand_start(self.action), opened=self.primitive.closes_fingers)
         try:
             self._execute()
             kind = OutcomeKind.OK if self._brushed else OutcomeKind.NO_CONTACT
@@ -136,23 +99,23 @@ class Trial:
         )
 
     def _execute(self) -> None:
-        path, gripper = trajectory(self.primitive), self.scene.gripper
-        self._leg(path.approach)
-        self._hold(last=path.then is None)
-        if self.primitive.pulls:
-            gripper.drive_fingers(0.0)
+        gripper, then = self.scene.gripper, self.primitive.then
+        self._leg(hand_pose(self.primitive.approach))
+        self._hold(last=then is None)
+        if self.primitive.closes_fingers:
+            gripper.close()
             self._hold(closing=True)
             self._opening = gripper.opening()
-            if self._opening <= GRASP_OPENING:
+            if not gripper.holds():
                 raise _TrialEndedError(OutcomeKind.NO_GRASP)
-        if path.then is not None:
+        if then is not None:
             self._timing = self.fidelity.drag
             self.scene.set_timing(self._timing)
-            self._leg(path.then)
+            self._leg(hand_pose(then))
             self._hold(last=True)
 
     def _leg(self, end: Float) -> None:
-        """Drive the hand along a straight line to `end`, [3], hand frame, at constant speed."""
+        """Drive the hand to `end`, [4], at constant speed."""
         gripper, steps = self.scene.gripper, self._timing.leg_steps
         path = np.linspace(self._hand_at, end, steps + 1)
         velocity = (end - self._hand_at) * (self._timing.steps_per_second / steps)
@@ -166,11 +129,11 @@ class Trial:
                 step += skipped
                 gripper.shift(path[step], velocity)
         gripper.drive(end)
-        gripper.drive_velocity(np.zeros(3))
+        gripper.drive_velocity(still())
         self._hand_at = end
 
     def _free_flight(self, path: Float, step: int) -> int:
-        """How many steps after `step` of the leg along `path`, [steps + 1, 3], will touch and move nothing.
+        """How many steps after `step` of the leg along `path`, [steps + 1, 4], will touch and move nothing.
 
         These need not be simulated. The hand is put ahead by no more than its clearance, so that it cannot pass through
         anything, and only while the object rests: before the first contact, or once the hand has let go of it.
@@ -179,10 +142,11 @@ class Trial:
             if step % REST_STEPS or not self._object_rests():
                 return 0
             self._clearance = self.scene.contact().clearance
-        if self._clearance <= CLEARANCE:
+        stride = float(np.linalg.norm(path[1, :3] - path[0, :3]))
+        # A hand that turns may come nearer than its way tells.
+        if self._clearance <= CLEARANCE or stride == 0 or path[0, 3] != path[-1, 3]:
             return 0
-        stride = float(np.linalg.norm(path[1] - path[0]))
-        lag = float(np.linalg.norm(path[step] - self.scene.gripper.displacement()))
+        lag = float(np.linalg.norm(path[step, :3] - self.scene.gripper.displacement()))
         ahead = min(int((self._clearance - CLEARANCE - lag) / stride), len(path) - 1 - step)
         return ahead if ahead >= LEAST_SKIP else 0
 
@@ -195,7 +159,7 @@ class Trial:
         """Keep all drive targets for a while.
 
         Args:
-            closing: the fingers close; once they are so near each other that they hold nothing, all is said.
+            closing: the fingers close; once they hold nothing, all is said.
             last: nothing comes after this hold, so that a hand which has let go of a resting object may move on.
         """
         before = np.zeros(0)
@@ -203,7 +167,7 @@ class Trial:
             self._step()
             if not self.fidelity.end_holds_at_rest or step % REST_STEPS:
                 continue
-            if closing and self.scene.gripper.opening() <= GRASP_OPENING:
+            if closing and not self.scene.gripper.holds():
                 return
             now = self.scene.coordinates()
             if step and np.abs(now - before).max() < REST_STEPS * REST_MOTION:
@@ -221,7 +185,7 @@ class Trial:
     def _check_first_contact(self) -> None:
         """The published first-contact rule; checking ends with the first valid contact.
 
-        Only a push can go wrong after the first step, so a pull is checked no longer than until it touches anything.
+        Where the rule does not hold, only the first step can go wrong, so that a touch ends the checking.
         """
         contact = self.scene.contact()
         self._brushed = self._brushed or contact.brushes
@@ -229,18 +193,18 @@ class Trial:
         if contact.presses:
             if self.steps == 1:
                 raise _TrialEndedError(OutcomeKind.START_COLLISION)
-            if not self.primitive.pulls and contact.palm:
+            if self.primitive.checks_contact and contact.palm:
                 raise _TrialEndedError(OutcomeKind.HAND_CONTACT)
-            if not self.primitive.pulls and contact.finger_on - {self.target}:
+            if self.primitive.checks_contact and contact.finger_on - {self.target}:
                 raise _TrialEndedError(OutcomeKind.WRONG_PART)
-        self._checked = contact.presses or (self.primitive.pulls and contact.brushes)
+        self._checked = contact.presses or (not self.primitive.checks_contact and contact.brushes)
 
     def _succeeded(self, start: float, end: float, displacement: Float) -> bool:
         low, high = self.scene.limits[self.target - 1]
         motion = abs(end - start)
         if not (motion > MOTION_THRESHOLD or motion > MOTION_SHARE * (high - low)):
             return False
-        intended = trajectory(self.primitive).intended
+        intended = self.primitive.intended
         if intended is None:
             return True
         length = float(np.linalg.norm(displacement))

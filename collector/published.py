@@ -16,12 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from collector.jointed_gripper import JointedGripper
+from collector.jointed_gripper import JointedGripper, on_arm
 from collector.primitives import Trial
 from collector.readers import read_object
 from collector.scene import Scene
 from shared.configuration import FIDELITIES, PUBLISHED_TIMING, StrictModel
-from shared.vocabulary import Action, Direction, Float, HiddenDynamics, OutcomeKind, Primitive
+from shared.primitives import PRIMITIVES
+from shared.vocabulary import Action, Direction, Float, HiddenDynamics, OutcomeKind
 
 STILL_STEPS, MOST_STEPS = 5000, 20_000
 """Where2Act's settling."""
@@ -48,7 +49,7 @@ class PublishedRequest(StrictModel):
     rotation: tuple[float, ...]
     """R, row by row."""
     target_part: int
-    primitive: Primitive
+    primitive: str
 
 
 class PublishedTiming(StrictModel):
@@ -70,15 +71,15 @@ class PublishedTrial(Trial):
     """A trial whose every step is controlled from Python, as the authors' robot is."""
 
     def _leg(self, end: Float) -> None:
-        """Drive the hand to `end`, [3], hand frame, by velocities of its joints that are computed at every step."""
+        """Drive the hand to `end`, [4], by velocities of its joints that are computed at every step."""
         gripper, steps, rate = _jointed(self.scene), PUBLISHED_TIMING.leg_steps, PUBLISHED_TIMING.steps_per_second
         hand, arm = gripper.articulation, gripper.joints[:6]
         palm, model = hand.links.index(gripper.palm), hand.create_pinocchio_model()
-        targets, twist = np.append(self._hand_at, np.zeros(3)), np.zeros(6)
+        targets, twist = on_arm(self._hand_at), np.zeros(6)
         for step in range(steps):
             positions = hand.get_qpos()
             if step % TWIST_EVERY_STEPS == 0:
-                twist[:3] = (end - positions[:3]) * (rate / (steps - step))
+                twist[:3] = (end[:3] - positions[:3]) * (rate / (steps - step))
             jacobian = model.compute_single_link_local_jacobian(positions, palm)[:, :6]
             velocities = np.linalg.pinv(jacobian, rcond=SINGULAR) @ twist
             targets += velocities / rate
@@ -110,7 +111,8 @@ def run(request: PublishedRequest) -> PublishedTiming:
     started = time.process_time()
     fidelity = FIDELITIES["reference"]
     dynamics = HiddenDynamics(request.part_mass, request.joint_friction, request.surface_friction, request.direction)
-    scene = Scene(read_object(request.folder), dynamics, fidelity, request.primitive)
+    primitive = PRIMITIVES.get(request.primitive)
+    scene = Scene(read_object(request.folder), dynamics, fidelity, primitive)
     positions = np.array(request.joint_positions)
     scene.restrict(positions)
     scene.put(positions)
@@ -120,7 +122,7 @@ def run(request: PublishedRequest) -> PublishedTiming:
     scene.put(positions)  # The stored trial's start, whatever a longer wait has made of it.
     settled = time.process_time()
     action = Action(0, np.array(request.point), np.array(request.rotation).reshape(3, 3))
-    outcome = PublishedTrial(scene, action, request.target_part, request.primitive, fidelity).run()
+    outcome = PublishedTrial(scene, action, request.target_part, primitive, fidelity).run()
     return PublishedTiming(
         start=started,
         load=loaded - started,

@@ -5,12 +5,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from collector.articulation import joint_twist
 from collector.clock import StageClock
-from collector.environment import SapienEnvironment
-from collector.primitives import hand_start
 from collector.proposers import RandomProposer
+from collector.simulator import SimEnvironment
 from shared.geometry import quaternion_from_rotation
+from shared.primitives import hand_start
 from shared.records import InteractionRecord
 from shared.vocabulary import Action, Interaction, Observation, Order, OutcomeKind, Proposer, Role
 
@@ -19,7 +18,7 @@ from shared.vocabulary import Action, Interaction, Observation, Order, OutcomeKi
 class Recorder:
     """Gathers what a rollout does: interactions in order, and every observation once."""
 
-    environment: SapienEnvironment
+    environment: SimEnvironment
     policy_version: int
     observations: list[Observation] = field(default_factory=list)
     interactions: list[InteractionRecord] = field(default_factory=list)
@@ -34,8 +33,7 @@ class Recorder:
         part = int(observation.part_ids[action.point_index])
         body = environment.object.bodies[part]
         assert body.joint is not None
-        positions, limits = environment.scene.joint_positions(), environment.scene.limits.copy()
-        twist = joint_twist(body.joint, environment.scene.body_pose(part))
+        state = environment.privileged(part)
         begun = time.perf_counter()
         outcome = environment.execute(action)
         self.interactions.append(
@@ -56,9 +54,9 @@ class Recorder:
                 target_link=body.link,
                 target_joint=body.joint.name,
                 joint_names=tuple(each.joint.name for each in environment.object.parts if each.joint is not None),
-                joint_positions=positions,
-                joint_limits=limits,
-                joint_twist=twist,
+                joint_positions=state.joint_positions,
+                joint_limits=state.joint_limits,
+                joint_twist=state.joint_twist,
                 hand_start=np.concatenate([hand_start(action), quaternion_from_rotation(action.rotation)]),
                 seconds=time.perf_counter() - begun,
             )

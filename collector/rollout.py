@@ -5,10 +5,10 @@ import numpy as np
 from collector.articulation import ArticulatedObject
 from collector.clock import StageClock
 from collector.draws import Draw, draw_rollout
-from collector.environment import SapienEnvironment
 from collector.evaluation import ProposerFactory, evaluate
 from collector.proposers import RandomProposer
 from collector.recorder import Recorder, try_from_one_state, try_repeatedly
+from collector.simulator import SIMULATORS, SimEnvironment
 from shared import seeds
 from shared.geometry import camera_pose
 from shared.plan import Plan
@@ -65,18 +65,15 @@ def quarantined_rollout(plan: Plan, index: int) -> RolloutRecord:
 
 def make_environment(
     plan: Plan, draw: Draw, target: ArticulatedObject, clock: StageClock, attempt: int = 0
-) -> SapienEnvironment:
+) -> SimEnvironment:
     """The simulated environment of one rollout."""
     setting = plan.setting
-    camera = setting.collection.camera
-    return SapienEnvironment(
+    return SIMULATORS.get(setting.collection.simulator).make(
         target,
         setting.task_record,
-        setting.terms.primitive,
+        setting.collection,
         draw.dynamics,
-        camera_pose(draw.azimuth_deg, draw.elevation_deg, camera.distance),
-        camera,
-        setting.collection.fidelity,
+        camera_pose(draw.azimuth_deg, draw.elevation_deg, setting.collection.camera.distance),
         seeds.generator(setting.seed, f"pixels/{plan.key}", draw.index, attempt),
         clock,
     )
@@ -106,7 +103,7 @@ def collect(
         if recorder.sound:
             environment.restore(start)
     while recorder.sound and (left := rollout.interactions - len(recorder.interactions)) > 0:
-        one_state = environment.task.closed  # Every draw of a state would give the same one.
+        one_state = task_named(plan.setting.task).closed  # Every draw of a state would give the same one.
         before = len(recorder.interactions)
         count = left if one_state else min(left, rollout.actions_per_state)
         try_from_one_state(recorder, random, count, Role.COLLECT, clock)
@@ -115,7 +112,7 @@ def collect(
         assert len(recorder.interactions) > before, "a state without targets is never used"
 
 
-def _next_state(environment: SapienEnvironment, states: np.random.Generator) -> bool:
+def _next_state(environment: SimEnvironment, states: np.random.Generator) -> bool:
     """Draw states until one is at rest and shows a target; whether one was found."""
     return any(environment.reset(states) and environment.shows_a_target() for _ in range(TRIES))
 

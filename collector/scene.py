@@ -10,10 +10,10 @@ import numpy as np
 
 from collector.articulation import ArticulatedObject, Joint
 from collector.engine import Assembly, Link, new_scene, physx, pose, sapien, set_mass
-from collector.gripper import Gripper, add_gripper
-from collector.jointed_gripper import add_jointed_gripper
-from shared.configuration import Fidelity, Timing
-from shared.vocabulary import Direction, Float, HiddenDynamics, Primitive
+from collector.grippers import GRIPPERS
+from shared.configuration import PANDA, Fidelity, Timing
+from shared.primitives import PrimitiveSpec
+from shared.vocabulary import Direction, Float, HiddenDynamics
 
 RESTITUTION = 0.01
 FRICTION_DAMPING = 1e5
@@ -62,6 +62,7 @@ class Scene:
         dynamics: the hidden draw, applied to every movable part.
         fidelity: time step, solver iterations, and how the hand flies.
         primitive: what will be executed.
+        gripper: the name of the hand.
 
     Attributes:
         system: SAPIEN's physics system; `system.step()` advances time.
@@ -69,12 +70,16 @@ class Scene:
     """
 
     def __init__(
-        self, target: ArticulatedObject, dynamics: HiddenDynamics, fidelity: Fidelity, primitive: Primitive
+        self,
+        target: ArticulatedObject,
+        dynamics: HiddenDynamics,
+        fidelity: Fidelity,
+        primitive: PrimitiveSpec,
+        gripper: str = PANDA,
     ) -> None:
         self.object = target
         self.dynamics = dynamics
-        pushes = primitive is Primitive.PUSH
-        iterations = fidelity.push_solver_iterations if pushes else fidelity.solver_iterations
+        iterations = fidelity.solver_iterations if primitive.needs_friction else fidelity.push_solver_iterations
         self._scene, self.system = new_scene(iterations)
         material = physx.PhysxMaterial(dynamics.surface_friction, dynamics.surface_friction, RESTITUTION)
         self._articulation, self._links = _add_object(self._scene, target, material)
@@ -86,8 +91,7 @@ class Scene:
         for link, joint in zip(self._links[1:], self._joints, strict=True):
             set_mass(link, dynamics.part_mass)
             joint.set_drive_property(0.0, FRICTION_DAMPING, force_limit=dynamics.joint_friction)
-        add_hand = add_jointed_gripper if fidelity.jointed_hand else add_gripper
-        self.gripper: Gripper = add_hand(self._scene, material)
+        self.gripper = GRIPPERS.get(gripper).build(self._scene, material, fidelity.jointed_hand)
         self._hand = {self.gripper.palm, *self.gripper.fingers}
         self._fidelity = fidelity
         self._impulse_squared = 0.0
@@ -103,7 +107,7 @@ class Scene:
     def park(self) -> None:
         """Take the hand out of reach, and step time as before any trial."""
         self.set_timing(self._fidelity.approach)
-        self.gripper.place(np.eye(3), PARKED, 0.0)
+        self.gripper.place(np.eye(3), PARKED, opened=False)
 
     def joint_positions(self) -> Float:
         """[parts], in part order."""

@@ -18,6 +18,7 @@ from collector.object_cache import ObjectCache
 from collector.proposers import RandomProposer
 from collector.receipt import Receipt
 from collector.rollout import quarantined_rollout, run_rollout
+from collector.setting import check_packages
 from shared.adaptation import Adapter
 from shared.methods import PROPOSERS, needs_policy
 from shared.plan import Job, Plan
@@ -98,7 +99,12 @@ class Worker:
         return _receipt(job, records, dict(clock.seconds))
 
     def execute(self, plan: Plan, index: int, clock: StageClock) -> RolloutRecord:
-        """Execute one rollout, and commit nothing."""
+        """Execute one rollout, and commit nothing.
+
+        Raises:
+            UsageError: the setting needs packages that are not installed here.
+        """
+        check_packages(plan.setting)
         return run_rollout(plan, index, self._load(plan, index, clock), partial(self._proposer, plan), clock)
 
     def _explain(self, job: Job, quarantined: Mapping[int, str]) -> list[Quarantined]:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from shared.documents import MAX_PROBLEMS, MAX_WORD, printable
 from shared.errors import UsageError
 from shared.files import read_named
-from shared.vocabulary import Order, Primitive
+from shared.vocabulary import Order
 
 MAX_CONFIGURATION_BYTES = 1 << 18
 MAX_DOTS = 100
@@ -18,7 +18,9 @@ MAX_DOTS = 100
 
 Collision = Literal["hulls", "decomposed"]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")]
-"""Of what is found by name (see `shared.extensions`); it stands in file names, flags and keys of plans."""
+"""Of something that a registry finds (`shared.extensions`); it stands in flags, file names and keys of plans, and a store
+can be read where the package that adds it is not installed."""
+PANDA, SAPIEN = "panda", "sapien"
 
 
 class StrictModel(BaseModel):
@@ -121,7 +123,7 @@ class Fidelity(StrictModel):
     drag: Timing = Timing(steps_per_second=240, leg_steps=480, hold_steps=480)
     """The second leg of every primitive but push: whether what is pinched or dragged slips hangs on its speed."""
     push_solver_iterations: int = Field(10, ge=1, le=255)
-    """Of the engine, for pushes."""
+    """Of the engine, for the primitive push, and for others that do not need friction."""
     solver_iterations: int = Field(20, ge=1, le=255)
     """For all other primitives, since friction between fingers and part needs more."""
     skip_free_flight: bool = True
@@ -176,8 +178,12 @@ class RolloutConfig(StrictModel):
 class CollectionConfig(StrictModel):
     """How interactions are collected, apart from which objects, how many, and by whom."""
 
-    primitive: Primitive | None = None
-    """Instead of the task's own primitive."""
+    primitive: Name | None = None
+    """Instead of the task's own: push, push-left, push-up, pull, pull-left, pull-up, or what a package adds."""
+    gripper: Name = Field(PANDA, exclude_if=lambda name: name == PANDA)
+    """The hand: panda, or what a package adds. Documents leave out the default, which they did not know once."""
+    simulator: Name = Field(SAPIEN, exclude_if=lambda name: name == SAPIEN)
+    """What rollouts are simulated with: sapien, or what a package adds; left out likewise."""
     camera: CameraConfig = CameraConfig()
     fidelity: Fidelity = Fidelity()
     collision: Collision = "hulls"

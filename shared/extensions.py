@@ -6,9 +6,9 @@ A package adds a primitive called "twist" by these lines of its pyproject.toml, 
     twist = "my_package.twist:TWIST"
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from shared.errors import UsageError
 
@@ -94,3 +94,16 @@ class Registry(Generic[Item]):
         if not isinstance(item, self._of):
             raise UsageError(f"{self.kind} '{entry.name}': '{entry.value}' is no {self._of.__name__}")
         return item
+
+
+def added_by_packages(used: Iterable[tuple[Registry[Any], str]]) -> tuple[str, ...]:
+    """Those of some used things that other packages add, such as "primitive twist: my-package 1.2".
+
+    Args:
+        used: where each is found, and its name.
+
+    Raises:
+        UsageError: one of them cannot be found.
+    """
+    packages = [(registry.kind, name, registry.package_of(name)) for registry, name in used]
+    return tuple(f"{kind} {name}: {package}" for kind, name, package in packages if package is not None)

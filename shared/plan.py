@@ -61,6 +61,9 @@ class Setting(StrictModel):
     objects: Annotated[tuple[ObjectRef, ...], FailFast(), Field(min_length=1)]
     collection: CollectionConfig
     evaluation: EvaluationConfig | None = None
+    extensions: tuple[str, ...] = Field((), exclude_if=lambda added: not added)
+    """What other packages add of what the setting uses, such as "primitive twist: my-package 1.2"; documents leave it
+    out where there is nothing (see `shared.extensions.added_by_packages`)."""
 
     @model_validator(mode="after")
     def _one_task(self) -> "Setting":

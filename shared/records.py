@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from shared.plan import ObjectRef
-from shared.vocabulary import Action, Float, HiddenDynamics, Observation, Order, Outcome, Primitive, Role
+from shared.vocabulary import Action, Float, HiddenDynamics, Observation, Order, Outcome, Role
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class InteractionRecord:
         action: p and R, world frame.
         outcome: what came of it.
         normal: [3], world frame, surface normal at p.
-        primitive: what was executed.
+        primitive: name of what was executed.
         order: whether the next interaction starts from the same state or from where this one ended.
         role: what the interaction is for.
         proposer: who chose the action.
@@ -41,7 +41,7 @@ class InteractionRecord:
     action: Action
     outcome: Outcome
     normal: Float
-    primitive: Primitive
+    primitive: str
     order: Order
     role: Role
     proposer: str

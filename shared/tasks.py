@@ -13,7 +13,7 @@ from pydantic import Field
 from shared.configuration import CollectionConfig, DynamicsRanges, Name, StrictModel, load_toml, parse
 from shared.errors import UsageError
 from shared.extensions import Registry
-from shared.vocabulary import Direction, Primitive
+from shared.vocabulary import Direction
 
 Word = Annotated[str, Field(min_length=1, max_length=64)]
 Words = Annotated[tuple[Word, ...], Field(max_length=1000)]
@@ -26,12 +26,12 @@ class Terms:
     """What a configuration says, or else its task: the one place where what is left to the task is looked up.
 
     Attributes:
-        primitive: what trials execute.
+        primitive: name of what trials execute.
         dynamics: what hidden dynamics are drawn from.
         edge_share: share of random actions at points near a part's edge.
     """
 
-    primitive: Primitive
+    primitive: str
     dynamics: DynamicsRanges
     edge_share: float
 
@@ -41,8 +41,8 @@ class Task(StrictModel):
 
     name: Name
     """What flags and rows call it."""
-    primitive: Primitive
-    """What the gripper executes."""
+    primitive: Name
+    """Name of the primitive that the gripper executes."""
     categories: Words = ()
     """The only categories that it applies to; empty: all."""
     part_names: Words = ()
@@ -86,11 +86,11 @@ TASKS = Registry(
     {
         task.name: task
         for task in (
-            Task(name="push", primitive=Primitive.PUSH),
-            Task(name="pull", primitive=Primitive.PULL, edge_share=0.5),
+            Task(name="push", primitive="push"),
+            Task(name="pull", primitive="pull", edge_share=0.5),
             Task(
                 name="pull-closed-door",
-                primitive=Primitive.PULL,
+                primitive="pull",
                 categories=("StorageFurniture", "Cabinet"),
                 part_names=("door",),
                 revolute_only=True,
@@ -99,7 +99,7 @@ TASKS = Registry(
             ),
             Task(
                 name="push-faucet",
-                primitive=Primitive.PUSH,
+                primitive="push",
                 categories=("Faucet",),
                 part_names=("switch",),
                 revolute_only=True,

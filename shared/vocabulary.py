@@ -26,22 +26,6 @@ Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 
-class Primitive(StrEnum):
-    """The six gripper primitives of Where2Act; each is a pure translation of the hand."""
-
-    PUSH = "push"
-    PUSH_LEFT = "push-left"
-    PUSH_UP = "push-up"
-    PULL = "pull"
-    PULL_LEFT = "pull-left"
-    PULL_UP = "pull-up"
-
-    @property
-    def pulls(self) -> bool:
-        """Whether the fingers start open and close after the approach."""
-        return self.value.startswith("pull")
-
-
 class OutcomeKind(StrEnum):
     """How a trial ended. Every kind but `ABANDONED` is an outcome of physics and so a label."""
 
@@ -50,13 +34,13 @@ class OutcomeKind(StrEnum):
     NO_CONTACT = "no-contact"
     """It ran to its end and touched nothing."""
     NO_GRASP = "no-grasp"
-    """A pull whose fingers closed on nothing (together open by at most 0.01)."""
+    """The fingers closed on nothing (together open by at most 0.01)."""
     START_COLLISION = "start-collision"
     """The hand was in collision at the very first step."""
     WRONG_PART = "wrong-part"
-    """A push whose finger first touched a part other than the target."""
+    """Under the first-contact rule: a finger first touched a part other than the target."""
     HAND_CONTACT = "hand-contact"
-    """A push whose palm touched anything before or at the first contact."""
+    """Under the first-contact rule: the palm touched anything before or at the first contact."""
     UNSTABLE = "unstable"
     """The simulation diverged (not a number, or a joint far outside its limits)."""
     ABANDONED = "abandoned"
@@ -172,7 +156,7 @@ class Outcome:
     displacement: Float = field(default_factory=lambda: np.full(3, np.nan))
     """[3], world frame, of the touched point of the target part."""
     grasp_opening: float = float("nan")
-    """How far both fingers together stayed open after closing; pulls only."""
+    """How far both fingers together stayed open, of primitives that close them."""
     steps: int = 0
     """Physics steps simulated."""
 

@@ -31,7 +31,6 @@ from shared.vocabulary import (
     Order,
     Outcome,
     OutcomeKind,
-    Primitive,
     Role,
 )
 
@@ -137,7 +136,7 @@ def fabricate_interaction(
             steps=int(rng.integers(1, 1440)),
         ),
         normal=normal,
-        primitive=Primitive.PUSH,
+        primitive="push",
         order=Order.RESTART,
         role=Role.COLLECT,
         proposer=plan.proposer,

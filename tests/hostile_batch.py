@@ -19,7 +19,8 @@ from collector.scene import Scene
 from shared.configuration import FIDELITIES, CameraConfig
 from shared.errors import ObjectError
 from shared.geometry import camera_pose
-from shared.vocabulary import HiddenDynamics, Primitive
+from shared.primitives import PRIMITIVES
+from shared.vocabulary import HiddenDynamics
 from tests.mutations import mutate
 
 DYNAMICS = HiddenDynamics(part_mass=0.05, joint_friction=0.05, surface_friction=1.0)
@@ -54,7 +55,7 @@ def verdict(folder: Path) -> str:
     except Exception as error:  # noqa: BLE001 - whatever else is raised is what we look for.
         return f"failed: {type(error).__name__} at {traceback.extract_tb(error.__traceback__)[-1]}: {error}"
     try:
-        scene = Scene(described, DYNAMICS, FIDELITIES["fast"], Primitive.PUSH)
+        scene = Scene(described, DYNAMICS, FIDELITIES["fast"], PRIMITIVES.get("push"))
         limits = described.limits()
         for share in (0.0, 0.5):
             scene.put(limits[:, 0] + share * (limits[:, 1] - limits[:, 0]))

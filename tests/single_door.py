@@ -51,17 +51,17 @@ def door(*, hinge: float = 0.3, lower: float = 0.0, upper: float = 1.5, overhang
     slab = box((-0.02, min(0.0, -2 * hinge), -0.3), (0.0, max(0.0, -2 * hinge), 0.3))
     carcass = box((-0.25, -inner, -inner), (0.3, inner, inner))
     joint = Joint("hinge", "revolute", 0, _translation(-0.3, hinge, 0.0), np.array([0.0, 0.0, -side]), lower, upper)
-    return _object(carcass, Body("slab", "rotation_door", joint, (slab,), (slab,)))
+    return base_with(carcass, Body("slab", "rotation_door", joint, (slab,), (slab,)))
 
 
 def drawer() -> ArticulatedObject:
     """A block of 0.4 x 0.4 x 0.4 that slides along +x from x = 0, without anything in its way."""
     block = box((0.0, -0.2, -0.2), (0.4, 0.2, 0.2))
     joint = Joint("slide", "prismatic", 0, np.eye(4), np.array([1.0, 0.0, 0.0]), 0.0, 0.5)
-    return _object(box((0.0, 1.0, 0.0), (0.1, 1.1, 0.1)), Body("block", "drawer", joint, (block,), (block,)))
+    return base_with(box((0.0, 1.0, 0.0), (0.1, 1.1, 0.1)), Body("block", "drawer", joint, (block,), (block,)))
 
 
-def _object(root: Mesh, part: Body) -> ArticulatedObject:
+def base_with(root: Mesh, part: Body) -> ArticulatedObject:
     body = Body("base", "furniture_body", None, (root,), (root,))
     return ArticulatedObject(
         ObjectRef(id="hand-made", category="StorageFurniture", content_hash="0" * 64), (body, part)

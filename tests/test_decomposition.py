@@ -21,8 +21,9 @@ from collector.scene import Scene
 from shared.configuration import FIDELITIES
 from shared.errors import ObjectError, UsageError
 from shared.geometry import gripper_rotation
+from shared.primitives import PRIMITIVES
 from shared.private import cache_folder
-from shared.vocabulary import HiddenDynamics, Primitive
+from shared.vocabulary import HiddenDynamics
 from tests.single_door import drawer
 
 EASY = HiddenDynamics(part_mass=0.2, joint_friction=0.05, surface_friction=1.0)
@@ -67,10 +68,10 @@ def ell() -> Mesh:
 
 def presses(target: ArticulatedObject, x: float) -> bool:
     """Whether the hand presses on anything with its fingers well below the open box's rim."""
-    scene = Scene(target, EASY, FIDELITIES["fast"], Primitive.PUSH)
+    scene = Scene(target, EASY, FIDELITIES["fast"], PRIMITIVES.get("push"))
     scene.put(np.zeros(1))
     down = gripper_rotation(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0]))
-    scene.gripper.place(down, np.array([x, 0.0, RIM]), 0.0)
+    scene.gripper.place(down, np.array([x, 0.0, RIM]), opened=False)
     scene.system.step()
     contact = scene.contact()
     return contact.palm or bool(contact.finger_on)

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 
 from collector.articulation import ArticulatedObject
-from collector.primitives import Trial, hand_start, trajectory
+from collector.primitives import Trial, hand_pose
 from collector.procedural import generate
 from collector.readers import read_object
 from collector.scene import Scene, restricted_limits
 from shared.configuration import FIDELITIES, PUBLISHED_LEG_S
 from shared.geometry import gripper_rotation
-from shared.vocabulary import Action, Direction, HiddenDynamics, Outcome, OutcomeKind, Primitive
+from shared.primitives import PRIMITIVES, PrimitiveSpec, hand_start
+from shared.vocabulary import Action, Direction, HiddenDynamics, Outcome, OutcomeKind
 from tests.single_door import door, drawer
 
 FAST = FIDELITIES["fast"]
+PUSH, PULL = PRIMITIVES.get("push"), PRIMITIVES.get("pull")
 EASY = HiddenDynamics(part_mass=0.2, joint_friction=0.05, surface_friction=1.0)
 INTO = np.array([1.0, 0.0, 0.0])
 
@@ -25,7 +27,7 @@ INTO = np.array([1.0, 0.0, 0.0])
 def act(
     target: ArticulatedObject,
     point: tuple[float, float, float],
-    primitive: Primitive = Primitive.PUSH,
+    primitive: PrimitiveSpec = PUSH,
     dynamics: HiddenDynamics = EASY,
     start: float = 0.0,
     approach: np.ndarray = INTO,
@@ -66,7 +68,7 @@ def move_under(
     speed: float = 0.0,
 ) -> np.ndarray:
     """Joint position after each step under a constant effort (N or N m) on the joint, from rest or from a speed."""
-    scene = Scene(target, HiddenDynamics(mass, friction, 1.0), FAST, Primitive.PUSH)
+    scene = Scene(target, HiddenDynamics(mass, friction, 1.0), FAST, PUSH)
     scene.put(np.zeros(1))
     scene._articulation.set_qvel(np.array([speed], dtype=np.float32))
     positions = []
@@ -119,7 +121,7 @@ def test_a_push_moves_a_free_drawer_as_far_as_the_hand_goes_and_friction_lets_it
 
 def test_a_locked_joint_never_moves() -> None:
     locked = HiddenDynamics(part_mass=0.2, joint_friction=1e4, surface_friction=1.0)
-    for primitive in Primitive:
+    for primitive in PRIMITIVES:
         for target, point in ((drawer(), (0.0, 0.0, 0.0)), (door(), (-0.32, -0.295, 0.0))):
             outcome = act(target, point, primitive, locked)
             assert outcome.motion < 1e-3
@@ -128,7 +130,7 @@ def test_a_locked_joint_never_moves() -> None:
 
 def test_a_closed_door_cannot_be_pushed_open_but_an_open_one_can_be_pushed_shut() -> None:
     assert not act(door(), (-0.32, 0.0, 0.0)).success
-    scene = Scene(door(), EASY, FAST, Primitive.PULL)
+    scene = Scene(door(), EASY, FAST, PULL)
     scene.put(np.array([0.5]))
     world = scene.body_pose(1)
     point = (world @ np.array([-0.02, -0.4, 0.0, 1.0]))[:3]
@@ -141,8 +143,8 @@ def test_a_closed_door_cannot_be_pushed_open_but_an_open_one_can_be_pushed_shut(
 @pytest.mark.parametrize("hinge", [0.3, -0.3])
 def test_a_pull_opens_a_door_at_its_free_edge_and_not_at_its_hinge(hinge: float) -> None:
     free, hung = -np.sign(hinge) * 0.295, np.sign(hinge) * 0.295
-    at_free = act(door(hinge=hinge), (-0.32, free, 0.0), Primitive.PULL)
-    at_hinge = act(door(hinge=hinge), (-0.32, hung, 0.0), Primitive.PULL)
+    at_free = act(door(hinge=hinge), (-0.32, free, 0.0), PULL)
+    at_hinge = act(door(hinge=hinge), (-0.32, hung, 0.0), PULL)
     assert at_free.success
     assert at_free.displacement[0] < 0
     assert not at_hinge.success
@@ -150,8 +152,8 @@ def test_a_pull_opens_a_door_at_its_free_edge_and_not_at_its_hinge(hinge: float)
 
 def test_mirrored_scenes_give_mirrored_outcomes() -> None:
     for y in (0.295, -0.295):
-        left = act(door(hinge=0.3), (-0.32, y, 0.05), Primitive.PULL)
-        right = act(door(hinge=-0.3), (-0.32, -y, 0.05), Primitive.PULL)
+        left = act(door(hinge=0.3), (-0.32, y, 0.05), PULL)
+        right = act(door(hinge=-0.3), (-0.32, -y, 0.05), PULL)
         assert left.kind is right.kind
         assert left.success is right.success
         assert left.motion == pytest.approx(right.motion, abs=5e-3)
@@ -159,8 +161,8 @@ def test_mirrored_scenes_give_mirrored_outcomes() -> None:
 
 def test_more_joint_friction_stops_a_pull_near_the_hinge_first() -> None:
     stiff = HiddenDynamics(part_mass=0.2, joint_friction=6.0, surface_friction=1.0)
-    assert act(door(), (-0.32, -0.295, 0.0), Primitive.PULL, EASY).success
-    assert not act(door(), (-0.32, -0.295, 0.0), Primitive.PULL, stiff).success
+    assert act(door(), (-0.32, -0.295, 0.0), PULL, EASY).success
+    assert not act(door(), (-0.32, -0.295, 0.0), PULL, stiff).success
 
 
 def test_less_surface_friction_makes_a_sideways_push_slip() -> None:
@@ -169,7 +171,7 @@ def test_less_surface_friction_makes_a_sideways_push_slip() -> None:
         act(
             drawer(),
             (0.2, 0.194, 0.0),
-            Primitive.PUSH_LEFT,
+            PRIMITIVES.get("push-left"),
             HiddenDynamics(0.2, 1.0, friction),
             approach=np.array([0.0, -1.0, 0.0]),
             forward=(1.0, 0.0, 0.0),
@@ -202,7 +204,7 @@ def test_less_surface_friction_makes_a_slanted_push_slip() -> None:
 
 def test_a_pull_that_pinches_nothing_is_no_grasp() -> None:
     slippery = HiddenDynamics(part_mass=0.2, joint_friction=0.05, surface_friction=0.1)
-    outcome = act(door(), (-0.32, 0.0, 0.0), Primitive.PULL, slippery)
+    outcome = act(door(), (-0.32, 0.0, 0.0), PULL, slippery)
     assert outcome.kind is OutcomeKind.NO_GRASP
     assert outcome.grasp_opening <= 0.01
     assert outcome.motion == 0.0
@@ -219,12 +221,12 @@ def test_the_first_contact_rule() -> None:
 
 def test_a_start_collision_leaves_the_object_where_it_was() -> None:
     # The hand starts within the slab of a half-open door, which the engine would throw off.
-    scene = Scene(door(), EASY, FAST, Primitive.PULL)
+    scene = Scene(door(), EASY, FAST, PULL)
     scene.put(np.array([0.5]))
     world = scene.body_pose(1)
     point = (world @ np.array([0.13, -0.4, 0.0, 1.0]))[:3]
     action = Action(0, point, gripper_rotation(world[:3, 0], np.array([0.0, 0.0, 1.0])))
-    outcome = Trial(scene, action, 1, Primitive.PUSH, FAST).run()
+    outcome = Trial(scene, action, 1, PUSH, FAST).run()
     assert outcome.kind is OutcomeKind.START_COLLISION
     assert outcome.end_joint_position == outcome.start_joint_position
     assert scene.settle(60, 480)
@@ -232,7 +234,7 @@ def test_a_start_collision_leaves_the_object_where_it_was() -> None:
 
 
 def test_a_settled_scene_stays_settled() -> None:
-    scene = Scene(door(), EASY, FAST, Primitive.PULL)
+    scene = Scene(door(), EASY, FAST, PULL)
     scene.put(np.array([0.7]))
     assert scene.settle(60, 240)
     before = scene.joint_positions()
@@ -245,7 +247,7 @@ def test_what_has_settled_stays_settled_whatever_it_is(tmp_path: Path) -> None:
     folders = generate(tmp_path, dict.fromkeys(("Faucet", "Microwave", "Switch", "Table", "TrashCan", "Window"), 1), 4)
     rng = np.random.default_rng(0)
     for target in map(read_object, folders):
-        scene, limits = Scene(target, EASY, FAST, Primitive.PULL), target.limits()
+        scene, limits = Scene(target, EASY, FAST, PULL), target.limits()
         scene.put(rng.uniform(limits[:, 0], limits[:, 1]))
         assert scene.settle(60, 960), target.ref.id
         before = scene.joint_positions()
@@ -262,7 +264,10 @@ def test_gravity_pulls_and_a_part_that_falls_is_not_settled() -> None:
     body = falling.parts[0]
     part = type(body)(body.link, body.part_name, upright, body.visuals, body.collisions)
     scene = Scene(
-        ArticulatedObject(falling.ref, (falling.bodies[0], part)), HiddenDynamics(0.2, 0.01, 1.0), FAST, Primitive.PULL
+        ArticulatedObject(falling.ref, (falling.bodies[0], part)),
+        HiddenDynamics(0.2, 0.01, 1.0),
+        FAST,
+        PULL,
     )
     scene.put(np.zeros(1))
     assert not scene.settle(60, 60)
@@ -271,7 +276,7 @@ def test_gravity_pulls_and_a_part_that_falls_is_not_settled() -> None:
 
 
 def test_the_same_trial_gives_the_same_bits_in_a_new_scene() -> None:
-    first, second = (act(door(), (-0.32, -0.295, 0.1), Primitive.PULL) for _ in range(2))
+    first, second = (act(door(), (-0.32, -0.295, 0.1), PULL) for _ in range(2))
     assert first.end_joint_position == second.end_joint_position
     assert np.array_equal(first.displacement, second.displacement)
 
@@ -286,19 +291,19 @@ def test_direction_modes_bound_the_joint_on_the_hidden_side() -> None:
 
 def test_a_drawer_that_may_only_come_out_cannot_be_pushed_in() -> None:
     for direction, moves in ((Direction.CLOCKWISE, True), (Direction.COUNTER_CLOCKWISE, False)):
-        scene = Scene(drawer(), HiddenDynamics(0.2, 0.05, 1.0, direction), FAST, Primitive.PULL)
+        scene = Scene(drawer(), HiddenDynamics(0.2, 0.05, 1.0, direction), FAST, PULL)
         scene.put(np.zeros(1))
         scene.restrict(np.zeros(1))
         action = Action(0, np.zeros(3), gripper_rotation(INTO, np.array([0.0, 0.0, 1.0])))
-        assert Trial(scene, action, 1, Primitive.PUSH, FAST).run().success is moves
+        assert Trial(scene, action, 1, PUSH, FAST).run().success is moves
 
 
 def test_fast_agrees_with_the_published_timing() -> None:
     for point in ((-0.32, -0.295, 0.0), (-0.32, 0.295, 0.0), (-0.32, -0.1, 0.1)):
-        for primitive in (Primitive.PUSH, Primitive.PULL):
+        for primitive in (PUSH, PULL):
             outcomes = []
             for fidelity in FIDELITIES.values():
-                scene = Scene(door(), EASY, fidelity, Primitive.PULL)
+                scene = Scene(door(), EASY, fidelity, PULL)
                 scene.put(np.array([0.0]))
                 action = Action(0, np.array(point), gripper_rotation(INTO, np.array([0.0, 0.0, 1.0])))
                 outcomes.append(Trial(scene, action, 1, primitive, fidelity).run())
@@ -306,18 +311,22 @@ def test_fast_agrees_with_the_published_timing() -> None:
             assert outcomes[0].success is outcomes[1].success
 
 
-@pytest.mark.parametrize("primitive", list(Primitive))
-def test_trajectories_are_the_published_ones(primitive: Primitive) -> None:
-    path = trajectory(primitive)
-    reach = 0.11 if primitive in (Primitive.PUSH_LEFT, Primitive.PUSH_UP) else 0.10
-    assert path.approach == pytest.approx([0, 0, 0.15 - reach])
-    if primitive is Primitive.PUSH:
-        assert path.then is None
-    elif primitive is Primitive.PULL:
-        assert path.then == pytest.approx([0, 0, 0])
+@pytest.mark.parametrize("name", PRIMITIVES.names())
+def test_trajectories_are_the_published_ones(name: str) -> None:
+    primitive = PRIMITIVES.get(name)
+    approach = hand_pose(primitive.approach)
+    reach = 0.11 if name in ("push-left", "push-up") else 0.10
+    assert approach == pytest.approx([0, 0, 0.15 - reach, 0])
+    if name == "push":
+        assert primitive.then is None
+        return
+    assert primitive.then is not None
+    then = hand_pose(primitive.then)
+    if name == "pull":
+        assert then == pytest.approx(np.zeros(4))
     else:
-        assert np.linalg.norm(path.then - path.approach) == pytest.approx(0.05)
-        assert path.intended @ (path.then - path.approach) == pytest.approx(0.05)
+        assert np.linalg.norm(then - approach) == pytest.approx(0.05)
+        assert primitive.intended @ (then - approach)[:3] == pytest.approx(0.05)
 
 
 def test_the_hand_starts_before_the_point() -> None:

@@ -17,16 +17,19 @@ from collector.procedural import generate
 from collector.proposers import LEAST_COSINE, RandomProposer, edge_points, random_rotation
 from collector.rollout import run_rollout
 from collector.scene import Scene
+from collector.setting import packages_used
 from collector.worker import Worker
 from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import ObjectError, UsageError
 from shared.geometry import camera_pose
 from shared.methods import METHODS, method_named
 from shared.plan import EvaluationConfig, Job, Plan, Setting
+from shared.primitives import PRIMITIVES
 from shared.records import RolloutRecord
 from shared.store import Store
 from shared.tasks import TASKS, task_named
 from shared.vocabulary import Action, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role
+from tests.fake_simulator import FAKE_SIMULATORS, FakeEnvironment
 from tests.single_door import door
 
 FRONT = camera_pose(180, 20, 5)
@@ -34,6 +37,7 @@ SMALL = CollectionConfig(
     camera=CameraConfig(image_size=128, points=256, candidates=1000),
     rollout=RolloutConfig(interactions=6, actions_per_state=3, context=2),
 )
+FAKE = SMALL.model_copy(update={"simulator": "fake"})
 
 
 class Named(RandomProposer):
@@ -60,6 +64,12 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A simulator of that name, for tests of the loop around one."""
+    monkeypatch.setattr("collector.rollout.SIMULATORS", FAKE_SIMULATORS)
+
+
 def plan_for(objects: Path, task: str = "push", **changes: object) -> Plan:
     refs = tuple(entry.ref for entry in for_task(scan(objects), task_named(task)).usable)
     return Plan(setting=Setting(task=task, seed=3, objects=refs, collection=SMALL).model_copy(update=changes))
@@ -79,6 +89,13 @@ def test_the_digest_does_not_depend_on_shards_order_or_age_of_the_worker(objects
             worker.run(plan, Job(plan.key, low, high))
         digests.append(store.digest())
     assert digests[0] == digests[1]
+
+
+def test_a_worker_without_the_packages_of_a_setting_does_nothing(objects: Path, tmp_path: Path) -> None:
+    plan = plan_for(objects, extensions=("primitive twist: my-package 1.2",))
+    worker = Worker(Store.create(tmp_path / "store", plan.setting).path, objects)
+    with pytest.raises(UsageError, match=r"is of primitive twist: my-package 1\.2, but here is no package; install"):
+        worker.run(plan, Job(plan.key, 0, 1))
 
 
 def test_a_job_done_twice_is_done_once(objects: Path, tmp_path: Path) -> None:
@@ -112,8 +129,9 @@ def test_a_rollout_is_about_one_part_and_rollouts_about_all(objects: Path) -> No
     assert max(map(len, touched.values())) > 1
 
 
+@pytest.mark.usefixtures("fake")
 def test_restart_order_tries_several_actions_from_one_observed_state(objects: Path) -> None:
-    record = rollout(plan_for(objects), objects)
+    record = rollout(plan_for(objects, collection=FAKE), objects)
     assert record.status == "ok"
     assert [row.step for row in record.interactions] == list(range(6))
     assert {row.order for row in record.interactions} == {Order.RESTART}
@@ -123,18 +141,21 @@ def test_restart_order_tries_several_actions_from_one_observed_state(objects: Pa
         assert all(np.array_equal(row.joint_positions, group[0].joint_positions) for row in group)
 
 
+@pytest.mark.usefixtures("fake")
 def test_continue_order_starts_where_the_last_try_left_the_object(objects: Path) -> None:
-    config = SMALL.model_copy(update={"rollout": RolloutConfig(interactions=8, order=Order.CONTINUE)})
+    config = FAKE.model_copy(update={"rollout": RolloutConfig(interactions=8, order=Order.CONTINUE)})
     record = rollout(plan_for(objects, collection=config), objects)
     assert {row.order for row in record.interactions} == {Order.CONTINUE}
+    assert any(row.outcome.success for row in record.interactions[:-1])
     for row, following in zip(record.interactions, record.interactions[1:], strict=False):
         if row.outcome.motion > 0.01:
             part = row.target_part - 1
             assert abs(following.joint_positions[part] - row.joint_positions[part]) > 1e-4
 
 
+@pytest.mark.usefixtures("fake")
 def test_a_policy_proposes_first_and_random_tries_fill_the_rest(objects: Path) -> None:
-    plan = plan_for(objects).model_copy(update={"proposer": "aip", "policy_version": 2})
+    plan = plan_for(objects, collection=FAKE).model_copy(update={"proposer": "aip", "policy_version": 2})
     record = rollout(plan, objects)
     assert [(row.proposer, row.policy_version) for row in record.interactions] == [("aip", 2)] * 2 + [("random", 0)] * 4
     assert [row.order for row in record.interactions] == [Order.CONTINUE] * 2 + [Order.RESTART] * 4
@@ -146,9 +167,10 @@ def test_a_row_is_enough_to_replay_its_interaction(objects: Path) -> None:
         record = rollout(plan, objects, index)
         target = load_ref(objects, record.object)
         for row in record.interactions:
-            scene = Scene(target, record.dynamics, plan.setting.collection.fidelity, row.primitive)
+            primitive = PRIMITIVES.get(row.primitive)
+            scene = Scene(target, record.dynamics, plan.setting.collection.fidelity, primitive)
             scene.put(row.joint_positions)
-            again = Trial(scene, row.action, row.target_part, row.primitive, plan.setting.collection.fidelity).run()
+            again = Trial(scene, row.action, row.target_part, primitive, plan.setting.collection.fidelity).run()
             assert again.kind is row.outcome.kind
             assert again.success is row.outcome.success
             assert again.end_joint_position == pytest.approx(row.outcome.end_joint_position, abs=5e-3)
@@ -176,9 +198,10 @@ def test_the_recorded_twist_says_where_the_touched_point_goes(objects: Path) -> 
         assert row.joint_names[row.target_part - 1] == row.target_joint
 
 
+@pytest.mark.usefixtures("fake")
 def test_evaluation_gives_every_method_the_same_start_and_the_same_questions(objects: Path) -> None:
     evaluation = EvaluationConfig(methods=("where2act", "ours-random", "ours-final"), budgets=(1, 2), queries=3)
-    plan = plan_for(objects, kind="evaluation", evaluation=evaluation)
+    plan = plan_for(objects, kind="evaluation", evaluation=evaluation, collection=FAKE)
     record = rollout(plan, objects)
     queries = [row for row in record.interactions if row.role is Role.QUERY]
     assert len(queries) == 3
@@ -196,10 +219,13 @@ def test_evaluation_gives_every_method_the_same_start_and_the_same_questions(obj
         assert {row.proposer for row in exploits} == {"where2act" if method == "where2act" else "aap"}
 
 
+@pytest.mark.usefixtures("fake")
 def test_methods_use_their_own_proposers_budgets_and_policies(objects: Path) -> None:
     methods = ("where2act-interaction", "where2act-adaptation", "ours-argfps", "ours-no-iteration", "ours-final")
     evaluation = EvaluationConfig(methods=methods, budgets=(2, 1), queries=1)
-    plan = plan_for(objects, kind="evaluation", evaluation=evaluation).model_copy(update={"policy_version": 3})
+    plan = plan_for(objects, kind="evaluation", evaluation=evaluation, collection=FAKE).model_copy(
+        update={"policy_version": 3}
+    )
     record = rollout(plan, objects)
     for name in methods:
         method, rows = METHODS.get(name), [row for row in record.interactions if row.method == name]
@@ -280,14 +306,15 @@ def test_real_objects_give_rollouts(real_objects: Path, object_id: str) -> None:
     assert len(record.interactions) == 6
 
 
+@pytest.mark.usefixtures("fake")
 def test_a_rollout_ends_where_the_simulation_diverges(objects: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     outcomes = iter([False, True])
 
-    def run(trial: Trial) -> Outcome:
+    def execute(environment: FakeEnvironment, action: Action) -> Outcome:
         return Outcome(OutcomeKind.UNSTABLE if next(outcomes) else OutcomeKind.OK, 0.0, False)
 
-    monkeypatch.setattr(Trial, "run", run)
-    record = rollout(plan_for(objects), objects)
+    monkeypatch.setattr(FakeEnvironment, "execute", execute)
+    record = rollout(plan_for(objects, collection=FAKE), objects)
     assert [row.outcome.kind for row in record.interactions] == [OutcomeKind.OK, OutcomeKind.UNSTABLE]
 
 
@@ -298,6 +325,30 @@ def test_a_setting_says_what_it_left_to_the_task() -> None:
     told = SMALL.model_copy(update={"rollout": RolloutConfig(edge_share=0.0)})
     assert task.resolve(told).rollout.edge_share == 0.0
     assert task.resolve(resolved) == resolved
+
+
+def test_what_has_the_default_hand_and_simulator_is_written_as_before_these_had_names() -> None:
+    written = SMALL.as_document()
+    assert not {"gripper", "simulator"} & written.keys()
+    assert FAKE.as_document() == {**written, "simulator": "fake"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"primitive": "shove"},
+            "unknown primitive 'shove'; allowed: push, push-left, push-up, pull, pull-left, pull-up",
+        ),
+        ({"gripper": "claw"}, "unknown gripper 'claw'; allowed: panda"),
+        ({"simulator": "dream"}, "unknown simulator 'dream'; allowed: sapien"),
+    ],
+)
+def test_a_setting_with_an_unknown_name_is_refused_with_those_there_are(changes: dict[str, str], said: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        packages_used(task_named("push"), SMALL.model_copy(update=changes))
+    assert str(refused.value) == said
+    assert packages_used(task_named("pull"), SMALL) == ()
 
 
 def test_a_setting_means_the_same_whether_it_was_resolved_or_not(objects: Path) -> None:

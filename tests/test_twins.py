@@ -16,7 +16,7 @@ from collector.procedural.cabinets import storage_furniture
 from collector.procedural.writing import write_object
 from collector.proposers import RandomProposer
 from collector.readers import read_object
-from shared.configuration import FIDELITIES, CameraConfig
+from shared.configuration import CameraConfig, CollectionConfig
 from shared.geometry import camera_pose, gripper_rotation
 from shared.tasks import Task, task_named
 from shared.vocabulary import Action, Direction, HiddenDynamics, Observation
@@ -35,9 +35,7 @@ def environment_of(
     """The object closed and at rest, seen from the front."""
     pose = camera_pose(azimuth_deg, 40.0, CAMERA.distance)
     rng = np.random.default_rng(7)
-    made = SapienEnvironment(
-        target, task, task.primitive, dynamics, pose, CAMERA, FIDELITIES["fast"], rng, StageClock()
-    )
+    made = SapienEnvironment(target, task, CollectionConfig(camera=CAMERA), dynamics, pose, rng, StageClock())
     assert made.reset(np.random.default_rng(7))
     return made
 

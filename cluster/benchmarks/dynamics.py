@@ -13,12 +13,13 @@ from collector.articulation import ArticulatedObject
 from collector.catalogue import load_ref
 from collector.clock import StageClock
 from collector.draws import draw_dynamics, draw_rollout, object_of
-from collector.environment import SAME_STATE, SapienEnvironment
+from collector.environment import SAME_STATE, SapienEnvironment, only_sapien
 from collector.primitives import Trial
 from collector.proposers import RandomProposer
 from collector.rollout import make_environment
 from shared import seeds
 from shared.plan import Plan
+from shared.primitives import PRIMITIVES
 from shared.vocabulary import Action, Float, HiddenDynamics, Observation, OutcomeKind
 
 ALL = "all"
@@ -144,6 +145,7 @@ def _rollout(plan: Plan, target: ArticulatedObject, index: int, draws: int, acti
     setting, task = plan.setting, plan.setting.task_record
     rng = seeds.generator(setting.seed, "bench/dynamics", index)
     states: list[_State] = []
+    primitive = PRIMITIVES.get(setting.terms.primitive)
     for _ in range(draws):
         environment = _environment(plan, target, index, draw_dynamics(setting.terms.dynamics, task, rng))
         if not environment.reset(seeds.generator(setting.seed, f"states/{plan.key}", index, 0)):
@@ -155,14 +157,15 @@ def _rollout(plan: Plan, target: ArticulatedObject, index: int, draws: int, acti
         for number, action in enumerate(state.actions):
             environment.scene.put(state.positions)
             part = int(state.observation.part_ids[action.point_index])
-            outcome = Trial(environment.scene, action, part, environment.primitive, setting.collection.fidelity).run()
+            outcome = Trial(environment.scene, action, part, primitive, setting.collection.fidelity).run()
             yield DynamicsTrial(target.ref.category, (index, place, number), outcome.kind, outcome.success)
             if outcome.kind is OutcomeKind.UNSTABLE:
                 break  # Nothing that this scene says later could be believed.
 
 
 def _environment(plan: Plan, target: ArticulatedObject, index: int, dynamics: HiddenDynamics) -> SapienEnvironment:
-    return make_environment(plan, replace(draw_rollout(plan, index), dynamics=dynamics), target, StageClock())
+    draw = replace(draw_rollout(plan, index), dynamics=dynamics)
+    return only_sapien(make_environment(plan, draw, target, StageClock()))
 
 
 def _proposer(plan: Plan, index: int) -> RandomProposer:

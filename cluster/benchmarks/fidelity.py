@@ -13,7 +13,7 @@ from cluster.benchmarks.progress import Advance
 from collector.catalogue import load_ref
 from collector.clock import StageClock
 from collector.draws import draw_rollout, object_of
-from collector.environment import SapienEnvironment
+from collector.environment import SapienEnvironment, only_sapien
 from collector.primitives import MOTION_THRESHOLD, Trial
 from collector.proposers import RandomProposer
 from collector.rollout import make_environment
@@ -21,6 +21,7 @@ from shared import seeds
 from shared.configuration import Fidelity
 from shared.errors import UsageError
 from shared.plan import Plan
+from shared.primitives import PRIMITIVES
 from shared.vocabulary import Action, Float, Observation, Outcome, OutcomeKind
 
 STATES, ACTIONS = 2, 4
@@ -163,7 +164,7 @@ def _rollout(reference: Plan, candidate: Plan, folder: Path, index: int) -> Iter
     seed, key = candidate.setting.seed, candidate.key
     collision = candidate.setting.collection.collision
     target, draw = load_ref(folder, object_of(candidate, index), collision), draw_rollout(candidate, index)
-    truth, judged = (make_environment(plan, draw, target, StageClock()) for plan in (reference, candidate))
+    truth, judged = (only_sapien(make_environment(plan, draw, target, StageClock())) for plan in (reference, candidate))
     proposer = RandomProposer(seeds.generator(seed, f"actions/{key}", index), candidate.setting.terms.edge_share)
     # Both draw the same states from streams of their own, so that both learn the same hidden direction mode.
     streams = [seeds.generator(seed, f"states/{key}", index, 0) for _ in range(2)]
@@ -192,5 +193,5 @@ def _try(
     environment.scene.put(positions)
     begun = time.process_time()
     part = int(observation.part_ids[action.point_index])
-    outcome = Trial(environment.scene, action, part, environment.primitive, fidelity).run()
+    outcome = Trial(environment.scene, action, part, PRIMITIVES.get(environment.primitive), fidelity).run()
     return outcome, time.process_time() - begun

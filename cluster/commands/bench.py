@@ -14,7 +14,6 @@ from cluster.selection import ObjectSelection
 from cluster.settings import parse_flags
 from shared.configuration import FIDELITIES, CollectionConfig, Fidelity
 from shared.errors import UsageError
-from shared.vocabulary import Primitive
 
 if TYPE_CHECKING:
     from shared.plan import Plan
@@ -27,7 +26,7 @@ class BenchSettings(ObjectSelection):
 
     task: str = "push"
     """Which manipulation task: push, pull, pull-closed-door, push-faucet, one that a package adds, or a TOML file."""
-    primitive: Primitive | None = None
+    primitive: str | None = None
     """Instead of the task's own primitive."""
     seed: int = Field(1, ge=0, lt=2**63)
     """Everything random derives from it."""
@@ -238,22 +237,16 @@ def planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
     """A plan of random interactions, and the folder of its objects; built-in objects last as long as the context."""
     task = command.task_record
     from cluster.objects import objects_for
-    from shared.plan import Plan, Setting
+    from collector.setting import make_setting
+    from shared.plan import Plan
 
     own = {} if command.primitive is None else {"primitive": command.primitive}
-    config = task.resolve(command.collection.model_copy(update=own))
+    collection = command.collection.model_copy(update=own)
     with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
         built_in = Path(scratch) / "objects"
         catalogue, folder = objects_for(task, command, built_in, command.procedural_per_category, command.seed)
         refs = tuple(entry.ref for entry in catalogue.usable)
-        setting = Setting(
-            task=task.name,
-            task_definition=command.task_definition,
-            seed=command.seed,
-            objects=refs,
-            collection=config,
-        )
-        yield Plan(setting=setting), folder
+        yield Plan(setting=make_setting(task, collection, seed=command.seed, objects=refs)), folder
 
 
 def finish(command: BenchSettings, name: str, result: dict[str, Any]) -> int:
@@ -263,9 +256,9 @@ def finish(command: BenchSettings, name: str, result: dict[str, Any]) -> int:
     objects = "built-in" if command.objects is None else command.objects.name
     result = {"task": command.task, "objects_from": objects} | result | {"benchmark": name, "seed": command.seed}
     if command.primitive is not None:
-        result["primitive"] = command.primitive.value
+        result["primitive"] = command.primitive
     if command.out is not None:
-        what = result["task"] if command.primitive is None else f"{command.task}-as-{command.primitive.value}"
+        what = result["task"] if command.primitive is None else f"{command.task}-as-{command.primitive}"
         print(f"kept in {keep(result, command.out, f'{name}-{what}-' + result['objects_from'])}")
     if command.as_json:
         print(as_line(result))

@@ -113,12 +113,14 @@ def _collect(command: CollectCommand, task: Task) -> None:
     from cluster.objects import objects_for
     from cluster.session import fleets
     from collector.guard import Limits
-    from shared.plan import Plan, Setting
+    from collector.setting import make_setting, packages_used
+    from shared.plan import Plan
     from shared.store import Store
     from shared.store.place import absolute, folder_beside
     from shared.store.provenance import changed_versions
 
     chosen, where = command.settings, absolute(command.store)
+    packages_used(task, chosen.collection)  # Refused before any object is read.
     catalogue, folder = objects_for(
         task,
         chosen,
@@ -126,12 +128,11 @@ def _collect(command: CollectCommand, task: Task) -> None:
         chosen.procedural_per_category,
         chosen.seed,
     )
-    setting = Setting(
-        task=task.name,
-        task_definition=chosen.task_definition,
+    setting = make_setting(
+        task,
+        chosen.collection,
         seed=chosen.seed,
         objects=_begun_with(where, tuple(entry.ref for entry in catalogue.usable)),
-        collection=task.resolve(chosen.collection),
     )
     store = Store.create(where, setting)
     if changed := changed_versions(store.document.software):

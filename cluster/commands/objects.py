@@ -8,9 +8,9 @@ import tyro
 from pydantic import Field
 
 from cluster.settings import parse_flags
+from shared.configuration import PANDA
 from shared.errors import UsageError
 from shared.plain import plain
-from shared.vocabulary import Primitive
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -70,8 +70,10 @@ class FilmCommand:
     """One object's folder, or a folder of objects, whose first usable one is taken."""
     out: Annotated[Path, tyro.conf.Positional]
     """The picture, a PNG."""
-    primitives: tuple[Primitive, ...] = tuple(Primitive)
-    """Only these."""
+    primitives: tuple[str, ...] = ()
+    """Only these; none named: all there are."""
+    gripper: str = PANDA
+    """The hand."""
     seed: int = 1
     """Of the random trials, one of which is shown of each primitive."""
 
@@ -146,18 +148,12 @@ def _draws_at_rest(entry: "CatalogueEntry", task: str | None) -> tuple[int, int]
     """How many of the draws of a rollout come to rest, and how many there are."""
     from collector.catalogue import load
     from collector.rollout import TRIES, draws_at_rest
+    from collector.setting import make_setting
     from shared.configuration import CollectionConfig
-    from shared.plan import Plan, Setting
+    from shared.plan import Plan
     from shared.tasks import task_of
 
-    named = task_of(task or "push")
-    setting = Setting(
-        task=named.name,
-        task_definition=None if named.name == task else named,
-        seed=1,
-        objects=(entry.ref,),
-        collection=named.resolve(CollectionConfig()),
-    )
+    setting = make_setting(task_of(task or "push"), CollectionConfig(), seed=1, objects=(entry.ref,))
     return draws_at_rest(Plan(setting=setting), 0, load(entry)), TRIES
 
 
@@ -175,11 +171,13 @@ def _preview(command: PreviewCommand) -> int:
 def _film(command: FilmCommand) -> int:
     from collector.catalogue import load, scan
     from collector.film import film
+    from shared.primitives import PRIMITIVES
 
     usable = scan(command.path).usable
-    if not usable or not command.primitives:
-        raise UsageError(f"{command.path}: a film needs a usable object and a primitive; try `adaafford objects check`")
-    for caption in film(load(usable[0]), command.primitives, command.seed, command.out):
+    if not usable:
+        raise UsageError(f"{command.path}: a film needs a usable object; try `adaafford objects check`")
+    primitives = [name for given in command.primitives for name in given.split(",") if name] or PRIMITIVES.names()
+    for caption in film(load(usable[0]), primitives, command.seed, command.out, command.gripper):
         print(caption)
     print(plain(f"{command.out}: {usable[0].ref.id}, {usable[0].ref.category}"))
     return 0

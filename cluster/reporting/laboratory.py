@@ -106,11 +106,9 @@ class Laboratory:
         return SapienEnvironment(
             case.target,
             self.task,
-            self.setting.terms.primitive,
+            collection,
             case.dynamics,
             camera_pose(middle, ELEVATION_DEG, collection.camera.distance),
-            collection.camera,
-            collection.fidelity,
             self._rng("pixels"),
             StageClock(),
         )

@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
-from shared.vocabulary import Direction, Float, Order, OutcomeKind, Primitive, Role
+from shared.vocabulary import Direction, Float, Order, OutcomeKind, Role
 
 Row = TypeVar("Row")
 
@@ -204,7 +204,7 @@ def _names_of(row: InteractionRow) -> str:
 def _choice_columns() -> tuple[Column[InteractionRow], ...]:
     i = operator.attrgetter("interaction")
     return (
-        Column("primitive", "", 0, "gripper primitive", lambda x: i(x).primitive, allowed=Primitive),
+        Column("primitive", "", 0, "gripper primitive", lambda x: i(x).primitive),
         Column("order", "", 0, "restart or continue", lambda x: i(x).order, allowed=Order),
         Column("role", "", 0, "what the row is for", lambda x: i(x).role, allowed=Role),
         Column("proposer", "", 0, "who chose the action", lambda x: i(x).proposer),

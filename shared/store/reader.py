@@ -38,7 +38,6 @@ from shared.vocabulary import (
     Order,
     Outcome,
     OutcomeKind,
-    Primitive,
     Role,
 )
 
@@ -326,7 +325,7 @@ def _interaction(row: dict[str, Any]) -> InteractionRecord:
             steps=int(row["steps"]),
         ),
         normal=row["normal"],
-        primitive=Primitive(row["primitive"]),
+        primitive=row["primitive"],
         order=Order(row["order"]),
         role=Role(row["role"]),
         proposer=row["proposer"],
