@@ -14,10 +14,9 @@ import numpy as np
 from collector.articulation import MIN_RANGE, ArticulatedObject
 from collector.decomposition import Decomposer
 from collector.files import short
-from collector.readers import READERS, ObjectReader, read_object, reader_of
+from collector.readers import READERS, read_object, reader_of
 from shared.configuration import Collision
 from shared.errors import ObjectError, UsageError
-from shared.extensions import Registry
 from shared.files import read_named
 from shared.plan import ObjectRef
 from shared.private import cache_folder
@@ -50,8 +49,6 @@ class CatalogueEntry:
     parts: tuple[PartSummary, ...]
     tree: Path
     """The folder that was scanned, below which links are followed."""
-    reader: str
-    """Which of `collector.readers.READERS` read it."""
     notes: tuple[str, ...] = ()
     """What was left out or read otherwise, one phrase each."""
 
@@ -68,10 +65,6 @@ class Catalogue:
     usable: tuple[CatalogueEntry, ...]
     refused: tuple[tuple[str, str], ...]
     """(id, reason in one line)."""
-
-    def readers(self) -> list[tuple[Registry[ObjectReader], str]]:
-        """The readers of the usable objects, each once, with the registry that knows them."""
-        return [(READERS, name) for name in sorted({entry.reader for entry in self.usable})]
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,9 +227,7 @@ def _object_folders(path: Path) -> dict[str, Path]:
 
 def _entry(folder: Path, tree: Path) -> CatalogueEntry:
     described = read_object(folder, tree)
-    return CatalogueEntry(
-        described.ref, folder, summaries(described), tree, reader_of(folder) or READERS.names()[0], described.notes
-    )
+    return CatalogueEntry(described.ref, folder, summaries(described), tree, described.notes)
 
 
 def _load(folder: Path, tree: Path, ref: ObjectRef) -> ArticulatedObject:

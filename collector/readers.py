@@ -4,6 +4,7 @@ Whatever the reader, an object's files are read through `ObjectFiles`, its conte
 and shapes are checked before anything else sees it.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,7 +79,8 @@ def read_object(folder: Path, tree: Path | None = None) -> ArticulatedObject:
     """
     files = ObjectFiles(folder, tree)
     # The first reader says what is missing in a folder that has no layout at all.
-    described = READERS.get(reader_of(folder) or READERS.names()[0]).read(files)
+    name = reader_of(folder) or READERS.names()[0]
+    described = READERS.get(name).read(files)
     if not 0 < len(described.category) <= MAX_WORD or not described.category.isprintable():
         raise ObjectError(f"{folder}: the category {short(described.category)} needs 1 to {MAX_WORD} printable letters")
     try:
@@ -86,7 +88,7 @@ def read_object(folder: Path, tree: Path | None = None) -> ArticulatedObject:
         ref = ObjectRef(
             id=folder.absolute().name,
             category=described.category,
-            content_hash=described.content_hash or files.digest(),
+            content_hash=_of_package(name, described.content_hash or files.digest()),
         )
     except ValidationError:
         raise ObjectError(
@@ -104,6 +106,12 @@ def read_object(folder: Path, tree: Path | None = None) -> ArticulatedObject:
 def alike(joints: Sequence[Joint]) -> str:
     """How the limits of joints that cannot move compare."""
     return "nearly the same" if any(joint.span for joint in joints) else "the same"
+
+
+def _of_package(reader: str, content_hash: str) -> str:
+    """With another version of the package that adds the reader, the same files may be another object."""
+    package = READERS.package_of(reader)
+    return content_hash if package is None else hashlib.sha256(f"{package} {content_hash}".encode()).hexdigest()
 
 
 def _check_shapes(bodies: Sequence[Body]) -> None:

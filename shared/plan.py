@@ -95,10 +95,10 @@ class Setting(StrictModel):
         return self.task_record.terms(self.collection)
 
 
-def found_by_name(setting: Setting) -> list[tuple[Registry[Any], str]]:
+def found_by_name(task: Task, evaluation: EvaluationConfig | None) -> list[tuple[Registry[Any], str]]:
     """The task, methods, proposers and baselines that a setting uses, each with the registry that knows it."""
-    used: list[tuple[Registry[Any], str]] = [] if setting.task_definition is not None else [(TASKS, setting.task)]
-    for name in () if setting.evaluation is None else setting.evaluation.methods:
+    used: list[tuple[Registry[Any], str]] = [(TASKS, task.name)] if task.name in TASKS.names() else []
+    for name in () if evaluation is None else evaluation.methods:
         method = METHODS.get(name)
         used.append((METHODS, name))
         used += [(PROPOSERS, method.tries)] if method.tries is not None and method.tries != RANDOM else []

@@ -57,8 +57,6 @@ def test_the_catalogue_asks_the_reader_of_another_package(tmp_path: Path) -> Non
     (tmp_path / "objects" / "nothing").mkdir()
     catalogue = scan(tmp_path / "objects")
     assert [entry.ref.id for entry in catalogue.usable] == ["large", "small"]
-    assert catalogue.readers() == [(READERS, "lids")]
-    assert READERS.package_of("lids") == "lids 1.0"
     assert [(name, "mobility.urdf" in why) for name, why in catalogue.refused] == [("nothing", True)]
     ref = catalogue.usable[1].ref
     assert load_ref(tmp_path / "objects", ref).ref == scan(tmp_path / "objects" / "small").usable[0].ref == ref
@@ -69,6 +67,13 @@ def test_the_content_hash_covers_the_files_that_were_read(tmp_path: Path) -> Non
     (tmp_path / "a" / "notes.txt").write_text("not read")
     assert read_object(tmp_path / "a").ref.content_hash == first
     assert read_object(write_lid(tmp_path / "a", upper=1.6)).ref.content_hash != first
+
+
+def test_the_content_hash_covers_the_version_of_the_package_that_reads(tmp_path: Path) -> None:
+    first = read_object(write_lid(tmp_path / "a")).ref.content_hash
+    metadata = tmp_path / "package" / "lids-1.0.dist-info" / "METADATA"
+    metadata.write_text(metadata.read_text().replace("Version: 1.0", "Version: 1.1"))
+    assert read_object(tmp_path / "a").ref.content_hash != first
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def test_its_task_and_its_proposer_collect(tmp_path: Path) -> None:
     rollouts = [rollout for job in store.jobs() for rollout in store.read_rollouts(job.shard_id)]
     proposers = {row.proposer for rollout in rollouts for row in rollout.interactions}
     assert proposers == {"furthest", "random"}
-    assert found_by_name(store.setting) == [(TASKS, "push-lid")]
+    assert found_by_name(store.setting.task_record, None) == [(TASKS, "push-lid")]
     assert TASKS.package_of("push-lid") == "adaafford-example 1.0"
     assert {store.manifest(job).provenance["proposer"] for job in store.jobs()} == {"adaafford-example 1.0"}
 
@@ -142,7 +142,9 @@ def test_a_setting_says_whose_methods_it_uses() -> None:
     setting = fabricated_plan().setting
     config = {"methods": ("surprise", "ours-final"), "budgets": (1,), "queries": 1}
     told = type(setting).model_validate(setting.as_document() | {"kind": "evaluation", "evaluation": config})
-    assert [name for registry, name in found_by_name(told) if registry.package_of(name)] == [
+    assert [
+        name for registry, name in found_by_name(told.task_record, told.evaluation) if registry.package_of(name)
+    ] == [
         "surprise",
         "furthest",
         "surprise",
