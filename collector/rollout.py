@@ -103,7 +103,7 @@ def collect(
         if recorder.sound:
             environment.restore(start)
     while recorder.sound and (left := rollout.interactions - len(recorder.interactions)) > 0:
-        one_state = task_named(plan.setting.task).closed  # Every draw of a state would give the same one.
+        one_state = plan.setting.task_record.closed  # Every draw of a state would give the same one.
         before = len(recorder.interactions)
         count = left if one_state else min(left, rollout.actions_per_state)
         try_from_one_state(recorder, random, count, Role.COLLECT, clock)

@@ -18,8 +18,8 @@ MAX_DOTS = 100
 
 Collision = Literal["hulls", "decomposed"]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")]
-"""Of something that a registry finds (`shared.extensions`); it stands in flags, file names and keys of plans, and a store
-can be read where the package that adds it is not installed."""
+"""Of something that a registry finds (`shared.extensions`); it stands in flags, file names and keys of plans. A store
+can be read where the package is not installed."""
 PANDA, SAPIEN = "panda", "sapien"
 
 

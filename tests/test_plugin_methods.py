@@ -1,7 +1,6 @@
 """The example package: what it adds is collected, trained, judged and listed without a change in ours."""
 
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -28,14 +27,9 @@ from tests.test_baselines import as_evaluation
 from tests.test_learner_data import fabricated_plan, fabricated_rollouts, make_store
 from tests.test_learner_training import FAST
 from tests.test_networks import TINY
+from tests.test_plugin import install
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-ADDED = {
-    "tasks": {"push-lid": "adaafford_example.push_lid:PUSH_LID"},
-    "proposers": {"furthest": "adaafford_example.furthest:FURTHEST"},
-    "baselines": {"surprise": "adaafford_example.surprise:BASELINE"},
-    "methods": {"surprise": "adaafford_example.surprise:METHOD"},
-}
 REGISTRIES: tuple["Registry[object]", ...] = (TASKS, PROPOSERS, BASELINES, METHODS)  # type: ignore[assignment]
 SMALL = "camera = {image_size = 64, points = 64, candidates = 64}\nrollout = {interactions = 4, context = 2}\n"
 LEARNER = FAST.model_copy(update={"baselines": {"surprise": {"steps": 20, "validate_every": 10, "learning_rate": 0.1}}})
@@ -43,27 +37,14 @@ LEARNER = FAST.model_copy(update={"baselines": {"surprise": {"steps": 20, "valid
 
 @pytest.fixture(autouse=True)
 def _installed(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The package as pip would install it, in a folder of its own on the path."""
+    """The package installed in this process, for one test."""
     place = tmp_path_factory.mktemp("site-packages")
-    distribution = place / "adaafford_example-1.0.dist-info"
-    distribution.mkdir()
-    (distribution / "METADATA").write_text("Metadata-Version: 2.1\nName: adaafford-example\nVersion: 1.0\n")
-    groups = {f"adaafford.{group}": names for group, names in ADDED.items()}
-    lines = [f"[{group}]\n" + "".join(f"{n} = {at}\n" for n, at in names.items()) for group, names in groups.items()]
-    (distribution / "entry_points.txt").write_text("\n".join(lines))
-    monkeypatch.syspath_prepend(EXAMPLES / "plugin")
-    monkeypatch.syspath_prepend(place)
+    install(place)
     for registry in REGISTRIES:
         monkeypatch.setattr(registry, "_loaded", {})
+    monkeypatch.syspath_prepend(place)
     for name in [name for name in sys.modules if name.startswith("adaafford_example")]:
         monkeypatch.delitem(sys.modules, name)
-
-
-def test_what_the_test_installs_is_what_the_package_says() -> None:
-    file = EXAMPLES / "plugin" / "pyproject.toml"
-    if file.exists():
-        told = tomllib.loads(file.read_text())["project"]["entry-points"]
-        assert {group: told[f"adaafford.{group}"] for group in ADDED} == ADDED
 
 
 def test_its_task_and_its_proposer_collect(tmp_path: Path) -> None:
@@ -77,8 +58,7 @@ def test_its_task_and_its_proposer_collect(tmp_path: Path) -> None:
     rollouts = [rollout for job in store.jobs() for rollout in store.read_rollouts(job.shard_id)]
     proposers = {row.proposer for rollout in rollouts for row in rollout.interactions}
     assert proposers == {"furthest", "random"}
-    assert found_by_name(store.setting.task_record, None) == [(TASKS, "push-lid")]
-    assert TASKS.package_of("push-lid") == "adaafford-example 1.0"
+    assert store.setting.extensions == ("task push-lid: adaafford-example 1.0",)
     assert {store.manifest(job).provenance["proposer"] for job in store.jobs()} == {"adaafford-example 1.0"}
 
 
