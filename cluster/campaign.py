@@ -39,7 +39,6 @@ from shared.plain import plain
 from shared.plan import Plan, Setting
 from shared.store import Store
 from shared.store.provenance import changed_versions, software_versions
-from shared.tasks import task_named
 
 
 class Crew:
@@ -124,7 +123,7 @@ class Campaign:
     def _choose_objects(self) -> Mapping[str, Any]:
         """Decide which objects are trained on and which are kept for the end, and make both stores."""
         run, config = self._run, self._config
-        task = task_named(config.task)
+        task = config.task_record
         packages_used(task, config.collection)  # What cannot be found is refused before any object is read.
         per_category = config.procedural.per_category
         built_in, lists = run.generated_objects.resolve(), lists_of(config.splits)
@@ -159,7 +158,7 @@ class Campaign:
         config = self._config
         objects = used.test if evaluation else (*used.train, *used.validation)
         return make_setting(
-            config.task,
+            config.task_record,
             config.collection,
             kind="evaluation" if evaluation else "collection",
             seed=config.seed,

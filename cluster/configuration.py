@@ -6,9 +6,8 @@ from pydantic import Field, field_validator, model_validator
 
 from cluster.selection import ObjectSelection, RayAddress
 from collector.guard import Limits
-from learner.configuration import AapConfig, AdaptationConfig, AipConfig, InteractionConfig, PriorConfig
+from learner.configuration import LearnerSettings
 from shared.configuration import CollectionConfig, StrictModel
-from shared.networks.configuration import NetworkConfig
 from shared.plan import ROLLOUTS_PER_SHARD, EvaluationConfig
 
 EXECUTION_SETTINGS = frozenset({"workers", "ray_address", "rollout_limit_s", "memory_limit_mb"})
@@ -79,22 +78,11 @@ class ProceduralConfig(StrictModel):
     """Objects of each category that the task applies to."""
 
 
-class LearnerSettings(StrictModel):
-    """What the learner is told, apart from the seed, which is the campaign's."""
-
-    network: NetworkConfig = NetworkConfig()
-    prior: PriorConfig = PriorConfig()
-    aap: AapConfig = AapConfig()
-    aip: AipConfig = AipConfig()
-    interaction: InteractionConfig = InteractionConfig()
-    adaptation: AdaptationConfig = AdaptationConfig()
-
-
 class CampaignConfig(ObjectSelection):
     """One campaign: a random round, then alternating training and AIP rounds, then evaluation on unseen objects."""
 
     task: str = "pull-closed-door"
-    """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
+    """Which manipulation task: push, pull, pull-closed-door, push-faucet, one that a package adds, or a TOML file."""
     seed: int = Field(1, ge=0, lt=2**63)
     """Everything random derives from it."""
     alternations: int = Field(1, ge=0, le=1000)

@@ -15,15 +15,14 @@ from cluster.configuration import CampaignConfig
 from cluster.objects import built_in_categories, lists_of, objects_for, split_as_told
 from collector.catalogue import ObjectSplit
 from learner.configuration import AffordanceConfig
+from learner.recipes import settings_of, training_of
 from shared.errors import UsageError
-from shared.fps import FPS_PROPOSERS
-from shared.methods import METHODS, baselines_of
+from shared.methods import METHODS, RANDOM, BaselineName, baselines_of
 from shared.networks.configuration import NetworkConfig
-from shared.networks.where2act_interaction import TRIES
 from shared.plan import ObjectRef
 from shared.policy import Policy
 from shared.primitives import PRIMITIVES
-from shared.tasks import Task, task_named
+from shared.tasks import Task
 from shared.vocabulary import Order
 
 
@@ -120,7 +119,7 @@ def estimate(config: CampaignConfig, rates: Rates = RATES) -> Estimate:
     Raises:
         UsageError: a folder or list of objects cannot be read, or too few suit the task.
     """
-    parts = _objects(task_named(config.task), config)
+    parts = _objects(config.task_record, config)
     counts = len(parts.train), len(parts.validation), len(parts.test)
     if not counts[0] or not counts[2]:
         raise UsageError(f"{sum(counts)} usable objects are too few to train on some and test on others")
@@ -146,7 +145,7 @@ class _Costs:
 
     def __init__(self, config: CampaignConfig, objects: tuple[int, int, int], rates: Rates) -> None:
         self.config, self.rates = config, rates
-        self.task = task_named(config.task)
+        self.task = config.task_record
         train, validation, self.tested = objects
         self.collected_on = train + validation
         camera, network = config.collection.camera, config.learner.network
@@ -173,14 +172,7 @@ class _Costs:
                 yield self._training(f"train-aap-{version}", self._aap_s(first=first), encoders=1 if first else 2)
                 yield self._training(f"train-aip-{version}", self._aip_s(), encoders=int(own))
         for name in baselines_of(self.config.evaluation.methods):
-            if name == "where2act-interaction":
-                told = learner.interaction
-                clouds = told.batch_rollouts * self._clouds_a_rollout(0)
-                rows = told.batch_rollouts * told.rows_per_rollout * (TRIES + 1)
-                seconds, encoders = self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance), 1
-            else:
-                rows = learner.adaptation.batch_rollouts * learner.adaptation.rows_per_rollout
-                seconds, encoders = self._steps_s(learner.adaptation.steps, 0, rows * learner.adaptation.context), 0
+            seconds, encoders = self._baseline_s(name)
             yield self._training(f"train-{name}", seconds, encoders)
         yield self._evaluation(rollouts.total(rollouts.evaluation, self.tested))
 
@@ -198,11 +190,11 @@ class _Costs:
     def _evaluation(self, rollouts: int) -> StageCost:
         """Random queries, then every method's tries, each from a state of its own, and its actions."""
         told = self.config.evaluation
-        methods = [METHODS[name] for name in told.methods]
+        methods = [METHODS.get(name) for name in told.methods]
         tries = [max(method.budgets(told.budgets)) if method.tries else 0 for method in methods]
         # Twice where there are tries: where these left the object, and where they began.
         chosen = sum(len(method.budgets(told.budgets)) * (2 if method.tries else 1) for method in methods)
-        by_policy = chosen + sum(n for n, m in zip(tries, methods, strict=True) if m.tries in (*FPS_PROPOSERS, "aip"))
+        by_policy = chosen + sum(n for n, m in zip(tries, methods, strict=True) if m.tries not in (None, RANDOM))
         interactions = rollouts * (told.queries + sum(tries) + chosen)
         clouds = rollouts * (1 + sum(tries))
         judging_s = clouds * FORWARD_SHARE * self.encode_s * 3
@@ -243,6 +235,13 @@ class _Costs:
         clouds = told.batch_rollouts * self._clouds_a_rollout(0) if told.training == "paper" else 0
         rows = told.batch_rollouts * told.rows_per_rollout * told.draws * (told.context + 1)
         return self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance)
+
+    def _baseline_s(self, name: BaselineName) -> tuple[float, int]:
+        told = settings_of(self.config.learner, name)
+        load = training_of(name).load(told)
+        seconds = self._steps_s(told.steps, load.rollouts * self._clouds_a_rollout(0), load.rows)
+        affordance = getattr(told, "affordance", None)
+        return seconds + (self._affordance_s(affordance) if affordance is not None else 0.0), load.encoders
 
     def _affordance_s(self, told: AffordanceConfig) -> float:
         answered = told.questions * told.proposals * self.rates.scored_row_s

@@ -81,8 +81,8 @@ class Evaluation:
             files = self.policies.read_policy(version)
             policy = Policy.from_files(files)
             for name in self.config.methods:
-                if METHODS[name].policy_version(self.version) == version:
-                    policy.require(*METHODS[name].modules)
+                if METHODS.get(name).policy_version(self.version) == version:
+                    policy.require(*METHODS.get(name).modules)
             self.store.publish_policy(version, files)
 
 

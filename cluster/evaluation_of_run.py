@@ -24,7 +24,7 @@ from shared.plain import plain
 from shared.plan import EvaluationConfig, ObjectRef, Setting
 from shared.policy import Policy
 from shared.store import Store
-from shared.tasks import Task, task_named
+from shared.tasks import Task
 
 
 def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> None:
@@ -37,10 +37,10 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
     policies, used = Store.open(run.store), run.objects_used()
     version = _version(run, policies, settings.policy)
     policy = Policy.from_files(policies.read_policy(version))
-    task = _task(config, settings.task)
+    task = _task(config, settings)
     refs, folder = _objects(task, settings, run, used)
     setting = make_setting(
-        task.name,
+        task,
         config.collection,
         kind="evaluation",
         seed=config.seed if settings.seed is None else settings.seed,
@@ -93,9 +93,10 @@ def _version(run: RunFolder, policies: Store, wanted: int | None) -> int:
     return known[-1] if wanted is None else wanted
 
 
-def _task(config: CampaignConfig, name: str | None) -> Task:
+def _task(config: CampaignConfig, settings: EvaluateSettings) -> Task:
     """The task to evaluate on; the networks were trained for one primitive and know no other."""
-    trained, task = task_named(config.task), task_named(name or config.task)
+    trained = config.task_record
+    task = trained if settings.task is None else settings.task_record
     if task.primitive != trained.primitive:
         raise UsageError(
             f"the run is trained to {trained.primitive} (task '{trained.name}'), and task '{task.name}' needs "
@@ -135,7 +136,7 @@ def _objects(
 
 def _possible_methods(policy: Policy) -> tuple[MethodName, ...]:
     """The methods whose networks are trained."""
-    return tuple(name for name, method in METHODS.items() if policy.trained.issuperset(method.modules))
+    return tuple(name for name in METHODS.names() if policy.trained.issuperset(METHODS.get(name).modules))
 
 
 def _default_out(run: RunFolder, setting: Setting, folder: Path, version: int) -> Path:

@@ -44,7 +44,7 @@ _PERCENT = frozenset({*MEASURES, "gap_closed", "best_f"})
 _ONLY_FOR_PROGRAMS = frozenset({"counts"})
 BEST_METHOD: MethodName = "ours-final"
 WITHOUT_TRIES = (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD)
-ORDER = (*METHODS, NO_TRIES_METHOD, ORACLE_METHOD)
+ORDER = (*METHODS.names(), NO_TRIES_METHOD, ORACLE_METHOD)
 """Of rows: as in the paper's tables, and then what stands beside them."""
 
 

@@ -16,7 +16,7 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
-from shared.configuration import CollectionConfig, DynamicsRanges, load_toml, merge, parse
+from shared.configuration import CollectionConfig, DynamicsRanges, Name, load_toml, merge, parse
 from shared.errors import UsageError
 
 PRESETS_FOLDER = Path(__file__).parent / "presets"
@@ -33,7 +33,7 @@ FLAG_TYPES = ConstructorRegistry()
 
 @FLAG_TYPES.primitive_rule
 def _list_with_commas(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """Let commas divide numbers and names from a choice, as spaces do (`--budgets 1,2,4`); paths may hold commas."""
+    """Let commas divide numbers and names, as spaces do (`--budgets 1,2,4`); paths may hold commas."""
     kind, *rest = get_args(info.type) or (None,)
     if info.type_origin is not tuple or rest != [Ellipsis]:
         return None
@@ -41,7 +41,8 @@ def _list_with_commas(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] 
     spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(as_list, info.markers))
     if isinstance(spec, UnsupportedTypeAnnotationError):
         return None
-    if spec.choices is None and PrimitiveTypeInfo.make(kind, info.markers).type is not int:
+    numbers = PrimitiveTypeInfo.make(kind, info.markers).type is int
+    if spec.choices is None and not numbers and kind != Name:
         return None
     choices = spec.choices
 
@@ -138,6 +139,8 @@ def parse_flags(command: type[Command], args: list[str], prog: str, default: Com
         )
     except ValidationError as error:
         problem = error.errors()[0]
+        if isinstance(cause := problem.get("ctx", {}).get("error"), UsageError):
+            raise cause from None
         name = ".".join(str(part) for part in problem["loc"])
         raise UsageError(f"flag for '{name}': {problem['msg']}; given {str(problem['input'])[:80]!r}") from None
     assert parsed is not None

@@ -14,7 +14,7 @@ import numpy as np
 from collector.articulation import MIN_RANGE, ArticulatedObject
 from collector.decomposition import Decomposer
 from collector.files import short
-from collector.partnet import URDF_FILE, read_object, urdf_of
+from collector.readers import READERS, read_object, reader_of
 from shared.configuration import Collision
 from shared.errors import ObjectError, UsageError
 from shared.files import read_named
@@ -93,8 +93,9 @@ def scan(path: Path, *object_lists: Path) -> Catalogue:
             names = ", ".join(str(each) for each in object_lists)
             raise UsageError(f"{names}: names no object; name a list of '<id> <category>' lines")
         folders = {object_id: folders.get(object_id, path / object_id) for object_id in listed}
-    elif all(urdf_of(folder) is None for folder in folders.values()):
-        raise UsageError(f"{path}: holds no object; name a folder of <id>/{URDF_FILE}, or one <id> itself")
+    elif all(reader_of(folder) is None for folder in folders.values()):
+        layouts = ", ".join(READERS.names())
+        raise UsageError(f"{path}: holds no object; name a folder of objects ({layouts}), or one object's folder")
     usable, refused = [], []
     for object_id in sorted(folders):
         try:
@@ -142,7 +143,7 @@ def load_ref(path: Path, ref: ObjectRef, collision: Collision = "hulls") -> Arti
     Raises:
         ObjectError: there is none, its files are not those that `ref` was made from, or it cannot be decomposed.
     """
-    loaded = _load(path / ref.id if urdf_of(path) is None else path.resolve(), path, ref)
+    loaded = _load(path / ref.id if reader_of(path) is None else path.resolve(), path, ref)
     if collision == "hulls":
         return loaded
     with Decomposer(cache_folder("pieces")) as decomposer:
@@ -216,7 +217,7 @@ def _object_folders(path: Path) -> dict[str, Path]:
     """Object folders by id."""
     if not path.is_dir():
         raise UsageError(f"{path}: no such folder; name a folder of objects, or one object's folder")
-    if urdf_of(path) is not None:
+    if reader_of(path) is not None:
         return {path.resolve().name: path.resolve()}
     try:
         return {child.name: child for child in path.iterdir() if child.is_dir() and not child.name.startswith(".")}

@@ -12,7 +12,7 @@ from shared import seeds
 from shared.configuration import DynamicsRanges, Range
 from shared.hidden import ALWAYS_DRAWN
 from shared.plan import ObjectRef, Plan
-from shared.tasks import Task, task_named
+from shared.tasks import Task
 from shared.vocabulary import HiddenDynamics
 
 
@@ -29,9 +29,10 @@ class Draw:
 
 def draw_rollout(plan: Plan, index: int, attempt: int = 0) -> Draw:
     """The draw of rollout `index`; a further `attempt` draws another camera only."""
-    setting, task = plan.setting, task_named(plan.setting.task)
+    setting = plan.setting
     ranges = setting.dynamics
-    dynamics = draw_dynamics(ranges, task, seeds.generator(setting.seed, f"dynamics/{plan.key}", index))
+    rng = seeds.generator(setting.seed, f"dynamics/{plan.key}", index)
+    dynamics = draw_dynamics(ranges, setting.task_record, rng)
     for name in ranges.added:
         # From a stream of its own, so that what else is drawn does not depend on it.
         rng = seeds.generator(setting.seed, f"dynamics/{name}/{plan.key}", index)

@@ -1,10 +1,12 @@
 """Reading the files of an object's folder, which came from outside: regular, small enough, and in their place."""
 
+import hashlib
 import os
 import re
 import stat
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from shared.errors import ObjectError
 
@@ -22,6 +24,13 @@ def short(text: object, length: int = 80) -> str:
     """`text` as it may stand in a one-line message: quoted, without control characters, not too long."""
     quoted = repr(str(text)[: length + 1])
     return quoted if len(quoted) <= length + 2 else quoted[:length] + "...'"
+
+
+def add_framed(digest: Any, *parts: bytes) -> None:
+    """Add parts to a hash with their lengths, which keep the boundary between two from being moved without notice."""
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "big"))
+        digest.update(part)
 
 
 class ObjectFiles:
@@ -48,6 +57,7 @@ class ObjectFiles:
         top = own if tree is None else tree.resolve()
         # What an object brings along is not trusted to be a cache.
         within = top.parents if top == own else (top, *top.parents)
+        self._read_so_far: dict[str, bytes] = {}
         self._roots = (own, top, *(cache for above in within for cache in _caches(above, top)))
 
     def exists(self, name: str) -> bool:
@@ -94,7 +104,15 @@ class ObjectFiles:
                     f"{self.folder}: {short(name)} is a pointer of {system} instead of the file, so the download is "
                     f"not complete; get the contents of all files (`{command}`)"
                 )
+        self._read_so_far[name] = hashlib.sha256(data).digest()
         return data
+
+    def digest(self) -> str:
+        """SHA-256 of the names and contents of all files that were read."""
+        digest = hashlib.sha256()
+        for name, content in sorted(self._read_so_far.items()):
+            add_framed(digest, name.encode("utf-8", "surrogatepass"), content)
+        return digest.hexdigest()
 
     def _read(self, resolved: Path, name: str, most_bytes: int) -> bytes:
         # A link that was put there since is not followed, and a pipe does not block.

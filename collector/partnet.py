@@ -14,16 +14,14 @@ from typing import Literal
 from urllib.parse import unquote
 
 import numpy as np
-from pydantic import ValidationError
 from pydantic_core import from_json
 
 from collector import meshes
-from collector.articulation import MIN_RANGE, ArticulatedObject, Body, Joint, Mesh
-from collector.bounds import check_bounds
-from collector.files import ObjectFiles, short
+from collector.articulation import MIN_RANGE, Body, Joint, Mesh
+from collector.files import ObjectFiles, add_framed, short
+from collector.readers import MAX_WORD, Description, alike
 from collector.urdf import MAX_URDF_BYTES, Shape, Urdf, UrdfJoint, parse_urdf
 from shared.errors import ObjectError
-from shared.plan import ObjectRef
 from shared.vocabulary import Float
 
 MAX_TEXT_BYTES = 1 << 20
@@ -32,7 +30,6 @@ MAX_OBJECT_VERTICES = 5_000_000
 """Over all shapes: a URDF may show one mesh many times."""
 MAX_OBJECT_TRIANGLES = 10_000_000
 """Over all mesh files."""
-MAX_WORD = 64
 MOST_NAMED = 3
 """Meshes and joints that a note names."""
 
@@ -48,56 +45,40 @@ def urdf_of(folder: Path) -> str | None:
     return next((name for name in URDF_FILES if (folder / name).is_symlink() or (folder / name).exists()), None)
 
 
-def read_object(folder: Path, tree: Path | None = None) -> ArticulatedObject:
-    """Read, check and merge one object.
+class PartNetReader:
+    """Reads, checks and merges one object.
 
     Links that fixed joints tie together become one body. A body without collision meshes collides as it looks.
-
-    Args:
-        folder: of the object.
-        tree: the folder of objects that the user named, below which links are followed; `folder` where none is given.
-
-    Raises:
-        ObjectError: with one line that says what is wrong with the object's files.
     """
-    files = ObjectFiles(folder, tree)
-    urdf_file = urdf_of(folder) or URDF_FILE
-    urdf_bytes = files.read(urdf_file, MAX_URDF_BYTES)
-    category = _category(files)
-    semantics = files.read(SEMANTICS_FILE, MAX_TEXT_BYTES) if files.exists(SEMANTICS_FILE) else b""
-    urdf = parse_urdf(urdf_bytes, str(folder / urdf_file))
-    if all(joint.kind == "fixed" for joint in urdf.joints):
-        raise ObjectError(f"{folder}: has no movable part: every joint is fixed")
-    documents = {urdf_file: urdf_bytes, SEMANTICS_FILE: semantics, "category": category.encode()}
-    found, digest = _Meshes(files, folder), hashlib.sha256()
-    for name in sorted({*documents, *urdf.mesh_files()}):
-        data = documents[name] if name in documents else found.load(name)
-        for part in () if data is None else (name.encode("utf-8", "surrogatepass"), data):
-            # Lengths keep the boundary between two files from being moved without notice.
-            digest.update(len(part).to_bytes(8, "big"))
-            digest.update(part)
-    ref = _reference(folder, category, digest.hexdigest())
-    bodies = _Bodies(urdf, found, _part_names(semantics, folder), folder).merged()
-    try:
-        check_bounds(bodies)
-    except ObjectError as error:
-        raise ObjectError(f"{folder}: {error}") from None
-    _require_a_movable_part(bodies, folder)
-    notes = [] if urdf_file == URDF_FILE else [f"read from {urdf_file}"]
-    return ArticulatedObject(ref, bodies, (*notes, *found.notes(), *_joint_notes(urdf, bodies)))
+
+    def matches(self, folder: Path) -> bool:
+        """Whether there is a URDF of one of the known names."""
+        return urdf_of(folder) is not None
+
+    def read(self, files: ObjectFiles) -> Description:
+        """The object; raises as every reader does."""
+        folder = files.folder
+        urdf_file = urdf_of(folder) or URDF_FILE
+        urdf_bytes = files.read(urdf_file, MAX_URDF_BYTES)
+        category = _category(files)
+        semantics = files.read(SEMANTICS_FILE, MAX_TEXT_BYTES) if files.exists(SEMANTICS_FILE) else b""
+        urdf = parse_urdf(urdf_bytes, str(folder / urdf_file))
+        if all(joint.kind == "fixed" for joint in urdf.joints):
+            raise ObjectError(f"{folder}: has no movable part: every joint is fixed")
+        documents = {urdf_file: urdf_bytes, SEMANTICS_FILE: semantics, "category": category.encode()}
+        # Of the category alone, since the rest of meta.json does not matter; and of the names that the URDF has.
+        found, digest = _Meshes(files, folder), hashlib.sha256()
+        for name in sorted({*documents, *urdf.mesh_files()}):
+            data = documents[name] if name in documents else found.load(name)
+            if data is not None:
+                add_framed(digest, name.encode("utf-8", "surrogatepass"), data)
+        bodies = _Bodies(urdf, found, _part_names(semantics, folder), folder).merged()
+        notes = [] if urdf_file == URDF_FILE else [f"read from {urdf_file}"]
+        notes += [*found.notes(), *_joint_notes(urdf, bodies)]
+        return Description(category, bodies, tuple(notes), digest.hexdigest())
 
 
-def _require_a_movable_part(bodies: Sequence[Body], folder: Path) -> None:
-    moving = [body for body in bodies if body.joint is not None and body.joint.span > MIN_RANGE]
-    if not moving:
-        joints = [body.joint for body in bodies if body.joint is not None]
-        first = joints[0]
-        raise ObjectError(
-            f"{folder}: has no movable part: no joint can move, since the lower and the upper limit of each are "
-            f"{_alike(joints)} (such as {first.lower:g} and {first.upper:g} of {short(first.name)})"
-        )
-    if not any(body.visuals for body in moving):
-        raise ObjectError(f"{folder}: has no movable part that can be seen: its moving links have no mesh")
+READER = PartNetReader()
 
 
 def _joint_notes(urdf: Urdf, bodies: Sequence[Body]) -> Iterator[str]:
@@ -105,31 +86,15 @@ def _joint_notes(urdf: Urdf, bodies: Sequence[Body]) -> Iterator[str]:
     still = [body.joint for body in bodies if body.joint is not None and body.joint.span <= MIN_RANGE]
     if still:
         names = _listed([short(joint.name) for joint in still])
-        yield f"{len(still)} of {len(bodies) - 1} joints cannot move, since both limits are {_alike(still)} ({names})"
+        yield f"{len(still)} of {len(bodies) - 1} joints cannot move, since both limits are {alike(still)} ({names})"
     mimics = [f"{short(joint.name)} of {short(joint.mimics)}" for joint in urdf.joints if joint.mimics]
     if mimics:
         yield f"<mimic> is not followed: what has it moves on its own ({_listed(mimics)})"
 
 
-def _alike(joints: Sequence[Joint]) -> str:
-    """How the limits of joints that cannot move compare."""
-    return "nearly the same" if any(joint.span for joint in joints) else "the same"
-
-
 def _listed(words: Sequence[str]) -> str:
     more = f" and {len(words) - MOST_NAMED} more" if len(words) > MOST_NAMED else ""
     return ", ".join(words[:MOST_NAMED]) + more
-
-
-def _reference(folder: Path, category: str, digest: str) -> ObjectRef:
-    # Of a link the name is its own, by which the object is found again below the folder of objects.
-    object_id = folder.absolute().name
-    try:
-        return ObjectRef(id=object_id, category=category, content_hash=digest)
-    except ValidationError:
-        raise ObjectError(
-            f"{folder}: the folder's name is the object's id and may hold letters, digits, '.', '_' and '-', up to 100"
-        ) from None
 
 
 def _category(files: ObjectFiles) -> str:

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from collector.jointed_gripper import JointedGripper, on_arm
-from collector.partnet import read_object
 from collector.primitives import Trial
+from collector.readers import read_object
 from collector.scene import Scene
 from shared.configuration import FIDELITIES, PUBLISHED_TIMING, StrictModel
 from shared.primitives import PRIMITIVES

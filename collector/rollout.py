@@ -13,7 +13,6 @@ from shared import seeds
 from shared.geometry import camera_pose
 from shared.plan import Plan
 from shared.records import RolloutRecord, RolloutStatus
-from shared.tasks import task_named
 from shared.vocabulary import Order, Proposer, Role
 
 TRIES = 8
@@ -71,7 +70,7 @@ def make_environment(
     setting = plan.setting
     return SIMULATORS.get(setting.collection.simulator).make(
         target,
-        task_named(setting.task),
+        setting.task_record,
         setting.collection,
         draw.dynamics,
         camera_pose(draw.azimuth_deg, draw.elevation_deg, setting.collection.camera.distance),
@@ -99,7 +98,7 @@ def collect(
         if recorder.sound:
             environment.restore(start)
     while recorder.sound and (left := rollout.interactions - len(recorder.interactions)) > 0:
-        one_state = task_named(plan.setting.task).closed  # Every draw of a state would give the same one.
+        one_state = plan.setting.task_record.closed  # Every draw of a state would give the same one.
         count = left if one_state else min(left, rollout.actions_per_state)
         state = environment.state()
         done = recorder.interact(random, count, Role.COLLECT, start=state)

@@ -7,38 +7,51 @@ from collector.simulator import SIMULATORS
 from shared.configuration import CollectionConfig
 from shared.errors import UsageError
 from shared.extensions import added_by_packages
-from shared.plan import Setting
+from shared.plan import EvaluationConfig, Setting, found_by_name
 from shared.primitives import PRIMITIVES
-from shared.tasks import Task, task_named
+from shared.tasks import TASKS, Task
 
 
-def make_setting(task: str, collection: CollectionConfig, **rest: Any) -> Setting:
+def make_setting(
+    task: Task, collection: CollectionConfig, evaluation: EvaluationConfig | None = None, **rest: Any
+) -> Setting:
     """A setting that says all that was decided, and names the packages that add to this software what it uses.
 
     Args:
-        task: name of the task.
+        task: the task; one that has no name in a registry is written out.
         collection: what it leaves to the task is filled in.
+        evaluation: what is tried on each object, in a store of an evaluation.
         rest: the other fields of `Setting`.
 
     Raises:
         UsageError: nothing is called as the setting says.
     """
-    named = task_named(task)
-    resolved = named.resolve(collection)
-    return Setting(task=task, collection=resolved, extensions=packages_used(named, collection), **rest)
+    return Setting(
+        task=task.name,
+        task_definition=None if task.name in TASKS.names() else task,
+        collection=task.resolve(collection),
+        evaluation=evaluation,
+        extensions=packages_used(task, collection, evaluation),
+        **rest,
+    )
 
 
-def packages_used(task: Task, collection: CollectionConfig) -> tuple[str, ...]:
+def packages_used(
+    task: Task, collection: CollectionConfig, evaluation: EvaluationConfig | None = None
+) -> tuple[str, ...]:
     """What other packages add of what a setting uses, such as "primitive twist: my-package 1.2".
 
     Raises:
         UsageError: something is not there.
     """
+    terms = task.terms(collection)
     return added_by_packages(
         [
-            (PRIMITIVES, task.terms(collection).primitive),
+            (PRIMITIVES, terms.primitive),
             (GRIPPERS, collection.gripper),
             (SIMULATORS, collection.simulator),
+            *terms.dynamics.extensions,
+            *found_by_name(task, evaluation),
         ]
     )
 
@@ -49,7 +62,7 @@ def check_packages(setting: Setting) -> None:
     Raises:
         UsageError: it needs others, or other versions of them.
     """
-    here = packages_used(task_named(setting.task), setting.collection)
+    here = packages_used(setting.task_record, setting.collection, setting.evaluation)
     if here != setting.extensions:
         wanted, found = ("; ".join(packages) or "no package" for packages in (setting.extensions, here))
         raise UsageError(f"the store is of {wanted}, but here is {found}; install the same on every machine")

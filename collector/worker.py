@@ -20,6 +20,7 @@ from collector.receipt import Receipt
 from collector.rollout import quarantined_rollout, run_rollout
 from collector.setting import check_packages
 from shared.adaptation import Adapter
+from shared.methods import PROPOSERS, needs_policy
 from shared.plan import Job, Plan
 from shared.policy import Policy
 from shared.proposers import proposer_named
@@ -85,6 +86,8 @@ class Worker:
                 records.append(self.execute(plan, index, clock))
         under_way(None)
         provenance = {}
+        if plan.proposer in PROPOSERS.names() and (package := PROPOSERS.package_of(plan.proposer)) is not None:
+            provenance["proposer"] = package
         if plan.policy_version:
             # Beside the version in each row this says how far that was behind, where collection follows a learner.
             provenance["newest_policy"] = str(max(self._store.policy_versions(), default=0))
@@ -124,6 +127,8 @@ class Worker:
         """The proposer called `name`, of a policy version."""
         if name == RandomProposer.name:
             return RandomProposer(rng, plan.setting.terms.edge_share)
+        if name in PROPOSERS.names() and not needs_policy(name):
+            return proposer_named(name, None, rng, plan.most_tries)
         if version not in self._adapters:
             self.load_policy(version, self._store.read_policy(version))
         return proposer_named(name, self._adapters[version], rng, plan.most_tries)

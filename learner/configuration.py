@@ -1,10 +1,11 @@
 """Settings of the learner, whose defaults fit a few thousand interactions and two cores, and names of its files."""
 
-from typing import Literal
+from typing import Annotated, Any, Literal
 
+import tyro
 from pydantic import Field
 
-from shared.configuration import StrictModel
+from shared.configuration import Name, StrictModel
 from shared.networks.configuration import NetworkConfig
 
 METRICS_FILE = "metrics.jsonl"
@@ -171,7 +172,20 @@ class AlternationConfig(StrictModel):
     """Rounds in a row that do not count, after which it has converged."""
 
 
-class LearnerConfig(StrictModel):
+class LearnerSettings(StrictModel):
+    """What decides the networks, apart from the seed; a campaign's `learner` settings."""
+
+    network: NetworkConfig = NetworkConfig()
+    prior: PriorConfig = PriorConfig()
+    aap: AapConfig = AapConfig()
+    aip: AipConfig = AipConfig()
+    interaction: InteractionConfig = InteractionConfig()
+    adaptation: AdaptationConfig = AdaptationConfig()
+    baselines: Annotated[dict[Name, dict[str, Any]], tyro.conf.Suppress] = Field({}, exclude_if=lambda told: not told)
+    """Of baselines that packages add, a table each by name, in files alone; `learner.recipes.settings_of` checks it."""
+
+
+class LearnerConfig(LearnerSettings):
     """Everything that `adaafford train` may be told by a file."""
 
     seed: int = Field(0, ge=0)
@@ -182,9 +196,3 @@ class LearnerConfig(StrictModel):
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of a training step's products; "bf16" is for GPUs, and CPUs with instructions for it. Weights stay in fp32."""
     alternation: AlternationConfig = AlternationConfig()
-    network: NetworkConfig = NetworkConfig()
-    prior: PriorConfig = PriorConfig()
-    aap: AapConfig = AapConfig()
-    aip: AipConfig = AipConfig()
-    interaction: InteractionConfig = InteractionConfig()
-    adaptation: AdaptationConfig = AdaptationConfig()

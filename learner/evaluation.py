@@ -14,16 +14,17 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from learner.bootstrap import ratio_interval
-from learner.critics import OracleScores, RowCritic, row_critic
+from learner.critics import OracleScores, row_critic
 from learner.data import Dataset, load_dataset
 from learner.features import FrozenFeatures
 from learner.metrics import THRESHOLD, discrimination
 from learner.oracle import OracleCritic
+from learner.recipes import RowCritic
 from shared.errors import StoreError
 from shared.methods import METHODS, CriticName, method_named
 from shared.policy import Policy
 from shared.store.store import Store
-from shared.tasks import task_named
+from shared.tasks import TASKS, task_named
 from shared.vocabulary import Role
 
 PRIOR_METHOD = "where2act"
@@ -166,7 +167,7 @@ def evaluate(
         StoreError: there is no QUERY row, or the data set is of a task with another primitive than a policy's.
     """
     for policy in policies.values():
-        if task_named(policy.task).primitive != task_named(dataset.task).primitive:
+        if policy.task != dataset.task and _primitive(policy.task) != _primitive(dataset.task):
             raise StoreError(f"the store is of task '{dataset.task}', but a policy of '{policy.task}'")
         policy.modules().eval()
     judge = _Judge(dataset, policies)
@@ -183,6 +184,11 @@ def evaluate(
     return rows
 
 
+def _primitive(task: str) -> str | None:
+    """What a task executes; None of one that a file defined, which whoever named both has compared."""
+    return task_named(task).primitive if task in TASKS.names() else None
+
+
 def _methods(dataset: Dataset) -> list[str]:
     """Methods that made tries, in the order of the paper's table.
 
@@ -190,10 +196,10 @@ def _methods(dataset: Dataset) -> list[str]:
         StoreError: a row is of a method that there is not.
     """
     found = set(dataset.rows.method.tolist()) - {""}
-    unknown = sorted(found - METHODS.keys())
+    unknown = sorted(found.difference(METHODS.names()))
     if unknown:
-        raise StoreError(f"the store holds rows of method '{unknown[0][:40]}'; known: {', '.join(METHODS)}")
-    return [name for name in METHODS if name in found and name != PRIOR_METHOD]
+        raise StoreError(f"the store holds rows of method '{unknown[0][:40]}'; known: {', '.join(METHODS.names())}")
+    return [name for name in METHODS.names() if name in found and name != PRIOR_METHOD]
 
 
 class _Judge:

@@ -1,29 +1,32 @@
 """What each stage trains, one network after the other."""
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any, Protocol
 
 import torch
 from safetensors.torch import save
+from torch import Tensor
 
 from learner import sharing
 from learner.aap import AapStage, OracleStage
 from learner.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic, RowOrder
 from learner.aip import AipStage
-from learner.configuration import AffordanceConfig, LearnerConfig, TrainingConfig
+from learner.configuration import AffordanceConfig, LearnerConfig, LearnerSettings, TrainingConfig
 from learner.data import Dataset, Split
 from learner.features import FrozenFeatures, ProposalPool
-from learner.frozen import FrozenAap, FrozenPrior
+from learner.frozen import FrozenAap
 from learner.hardware import Hardware
 from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
 from learner.training import Stage, TrainingResult, train
-from learner.where2act_adaptation import AdaptationStage
-from learner.where2act_interaction import InteractionStage
+from shared.configuration import parse
+from shared.errors import UsageError
 from shared.files import write_atomically
-from shared.methods import ModuleName
-from shared.networks.where2act_interaction import TRIES
+from shared.methods import BASELINES, BaselineName, ModuleName
 from shared.policy import Policy
 from shared.seeds import generator, torch_seed
 
@@ -92,21 +95,19 @@ class Recipe:
                 return self._aap()
             case "aip":
                 return self._aip()
-            case "where2act-interaction":
-                return self._interaction()
-            case "where2act-adaptation":
-                return self._adaptation()
+            case _:
+                return training_of(stage).train(self, settings_of(self.config, stage))
 
     def _prior(self) -> TrainingResult:
         prior, config = self.policy.prior.requires_grad_(True), self.config.prior
         result = self.runner.train(PriorStage(prior, self.dataset, self.parts, config), config, "prior")
         prior.eval().requires_grad_(False)
-        pool = self._pool()
-        affordance = self._affordance("prior", PriorCritic(prior, pool), config.affordance, pool)
+        pool = self.pool()
+        affordance = self.affordance("prior", PriorCritic(prior, pool), config.affordance, pool)
         return self.runner.train_affordance(affordance, config.affordance, result)
 
     def _aap(self) -> TrainingResult:
-        aap, config, pool = self.policy.aap.requires_grad_(True), self.config.aap, self._pool()
+        aap, config, pool = self.policy.aap.requires_grad_(True), self.config.aap, self.pool()
         # An AAP that has been trained has a z of its own, which a new oracle would only disturb; the old one may teach.
         trained, oracle = "aap" in self.policy.trained, self.oracle
         if config.training == "privileged" and not trained:
@@ -115,41 +116,21 @@ class Recipe:
         stage = AapStage(aap, self.known, self.parts, config, teacher, trained=trained)
         result = self.runner.train(stage, config, "aap")
         frozen = FrozenAap.of(aap, self.known)
-        affordance = self._affordance("aap", AapCritic(frozen, config.top), config.affordance, pool, frozen)
+        affordance = self.affordance("aap", AapCritic(frozen, config.top), config.affordance, pool, frozen)
         return self.runner.train_affordance(affordance, config.affordance, result)
 
     def _aip(self) -> TrainingResult:
-        aip, config, pool = self.policy.aip.requires_grad_(True), self.config.aip, self._pool()
+        aip, config, pool = self.policy.aip.requires_grad_(True), self.config.aip, self.pool()
         frozen = FrozenAap.of(self.policy.aap, self.known)
         teacher = self._teacher(self.oracle if config.training == "inherited" else None)
         stage = AipStage(aip, self.dataset, self.parts, config, frozen, teacher)
         result = self.runner.train(stage, config, "aip")
         aip.eval().requires_grad_(False)
         critic = AipCritic(aip, self.known.pool(aip.encoder), frozen, config.top)
-        affordance = self._affordance("aip", critic, config.affordance, pool, frozen)
+        affordance = self.affordance("aip", critic, config.affordance, pool, frozen)
         return self.runner.train_affordance(affordance, config.affordance, result)
 
-    def _interaction(self) -> TrainingResult:
-        network, config = self.policy.where2act_interaction, self.config.interaction
-        assert network is not None, "a baseline is begun before it is trained"
-        pool, prior = self._pool(), FrozenPrior.of(self.policy.prior, self.known)
-        stage = InteractionStage(network.requires_grad_(True), self.dataset, self.parts, config, prior)
-        result = self.runner.train(stage, config, stage.name)
-        frozen = FrozenAap.of(network, self.known)
-        # The mean of all proposals' scores, as Where2Act has it, and not of the best.
-        critic = AapCritic(frozen, config.affordance.proposals)
-        settings = config.affordance.model_copy(update={"context": TRIES})
-        affordance = self._affordance("where2act-interaction", critic, settings, pool, frozen, stage.order, TRIES)
-        return self.runner.train_affordance(affordance, settings, result)
-
-    def _adaptation(self) -> TrainingResult:
-        network, config = self.policy.where2act_adaptation, self.config.adaptation
-        assert network is not None, "a baseline is begun before it is trained"
-        prior = FrozenPrior.of(self.policy.prior, self.known)
-        stage = AdaptationStage(network.requires_grad_(True), self.dataset, self.parts, config, prior)
-        return self.runner.train(stage, config, stage.name)
-
-    def _affordance(
+    def affordance(
         self,
         stage: ModuleName,
         critic: Critic,
@@ -166,7 +147,8 @@ class Recipe:
             name, critic, self.dataset, self.parts, config, pool, rng, frozen=frozen, order=order, shortest=shortest
         )
 
-    def _pool(self) -> ProposalPool:
+    def pool(self) -> ProposalPool:
+        """Rotations that the prior proposes at the points of the pool."""
         return ProposalPool.of(self.policy.prior, self.known)
 
     def _teacher(self, oracle: OracleCritic | None) -> Teacher | None:
@@ -191,3 +173,86 @@ class Recipe:
         for inherited in ("encoder", "action_encoder", "critic_head"):
             getattr(self.policy.aap, inherited).load_state_dict(getattr(critic.aap, inherited).state_dict())
         return critic
+
+
+class RowCritic(Protocol):
+    """What a method believes of rows after tries of the same rollout."""
+
+    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
+        """Scores in [0, 1] of rows, [Q], after the rows `tries`, [K], of which there may be none; [Q]."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What one step of a training works through, for estimates.
+
+    Attributes:
+        rollouts: whose clouds are encoded, forward and backward.
+        rows: that pass a critic.
+        encoders: point encoders that are frozen and see every cloud once.
+    """
+
+    rollouts: int
+    rows: int
+    encoders: int
+
+
+@dataclass(frozen=True, slots=True)
+class BaselineTraining:
+    """How a baseline is trained, and judged by rows (`shared.methods.Baseline` names where it stands).
+
+    Attributes:
+        settings: the model of its settings.
+        train: trains its network, `recipe.policy.baselines[name]`, on `recipe.dataset`; of a recipe and the settings.
+        row_critic: what the trained network of a policy believes of the rows of a data set.
+        load: of a step, by the settings.
+        table: the table of its settings in `LearnerSettings`; "": `baselines.NAME`.
+    """
+
+    settings: type[TrainingConfig]
+    train: Callable[[Recipe, Any], TrainingResult]
+    row_critic: Callable[[Policy, FrozenFeatures], RowCritic]
+    load: Callable[[Any], Load]
+    table: str = ""
+
+
+def training_of(name: BaselineName) -> BaselineTraining:
+    """How a baseline is trained.
+
+    Raises:
+        UsageError: there is no such baseline, or what trains it cannot be imported.
+    """
+    place = BASELINES.get(name).training
+    try:
+        training = EntryPoint(name, place, "training").load()
+    except Exception as error:
+        raise UsageError(
+            f"baseline '{name}': '{place}' cannot be imported ({type(error).__name__}: {error})"
+        ) from error
+    if not isinstance(training, BaselineTraining):
+        raise UsageError(f"baseline '{name}': '{place}' is no BaselineTraining")
+    return training
+
+
+def settings_of(settings: LearnerSettings, name: BaselineName) -> TrainingConfig:
+    """The settings of a baseline.
+
+    Raises:
+        UsageError: one of them is unknown or not allowed.
+    """
+    training = training_of(name)
+    told = getattr(settings, training.table) if training.table else settings.baselines.get(name, {})
+    return told if isinstance(told, training.settings) else parse(training.settings, told, f"baselines.{name}")
+
+
+def check_baselines(settings: LearnerSettings) -> None:
+    """Refuse settings of baselines that would be found wrong, or not be found, when these are trained.
+
+    Raises:
+        UsageError: there is no such baseline, or one of its settings is unknown or not allowed.
+    """
+    for name in settings.baselines:
+        if table := training_of(name).table:
+            raise UsageError(f"settings of the baseline '{name}' belong into the table '{table}', not into 'baselines'")
+        settings_of(settings, name)

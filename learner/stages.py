@@ -35,7 +35,7 @@ from shared.documents import read_document
 from shared.errors import UsageError
 from shared.files import exclusive_lock, read_bounded, write_atomically
 from shared.formatting import finite
-from shared.methods import ModuleName
+from shared.methods import BASELINES, ModuleName
 from shared.networks.configuration import NetworkConfig
 from shared.policy import (
     MAX_POLICY_JSON_BYTES,
@@ -61,10 +61,13 @@ NEEDED: dict[StageName, tuple[ModuleName, ...]] = {
     "prior": (),
     "aap": ("prior",),
     "aip": ("prior", "aap"),
-    "where2act-interaction": ("prior",),
-    "where2act-adaptation": ("prior",),
 }
-"""What must have been trained before; the last of them is the stage to start from."""
+"""What must have been trained before; the last of them is the stage to start from. Baselines say it themselves."""
+
+
+def needed(stage: StageName) -> tuple[ModuleName, ...]:
+    """What must have been trained before a stage."""
+    return NEEDED[stage] if stage in NEEDED else BASELINES.get(stage).needs
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,14 +268,14 @@ def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Polic
     task = store.setting.task
     if job.init is None:
         if job.stage != "prior":
-            before = NEEDED[job.stage][-1]
+            before = needed(job.stage)[-1]
             raise UsageError(f"the stage '{job.stage}' starts from a policy: add --init with the --out of '{before}'")
         return Policy.untrained(task, config.network, torch_seed(config.seed, "learner.weights") % 2**32)
     policy = read_policy_folder(job.init)
     if policy.task != task:
         raise UsageError(f"{job.init}: a policy for '{policy.task}', but the store is of '{task}'; use one of its task")
-    policy.require(*NEEDED[job.stage])
-    if job.stage in ("where2act-interaction", "where2act-adaptation"):
+    policy.require(*needed(job.stage))
+    if job.stage in BASELINES.names():
         policy.begin_baseline(job.stage, torch_seed(config.seed, f"learner.{job.stage}.weights") % 2**32)
     return policy
 

@@ -9,13 +9,16 @@ from torch import Tensor, nn
 
 from learner.configuration import AdaptationConfig
 from learner.data import Dataset, Split
+from learner.features import FrozenFeatures
 from learner.frozen import FrozenPrior
 from learner.losses import correction_loss
 from learner.metrics import discrimination
+from learner.recipes import BaselineTraining, Load, Recipe
 from learner.sampling import OrderedRows, draw_numbers, order_rows, spread
 from learner.sharing import share
-from learner.training import ParameterGroup, StepResult
-from shared.networks.where2act_adaptation import Where2ActAdaptation, influences
+from learner.training import ParameterGroup, StepResult, TrainingResult
+from shared.networks.where2act_adaptation import NAME, Where2ActAdaptation, influences
+from shared.policy import Policy
 
 VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 24
@@ -28,7 +31,7 @@ class AdaptationStage:
     of its prefixes. Everything that Where2Act says is computed once, so that a step costs a small perceptron.
     """
 
-    name = "where2act-adaptation"
+    name = NAME
 
     def __init__(
         self,
@@ -109,3 +112,36 @@ def corrected_scores(
     added = influences(similarities, rows.success[tries], prior.scores[tries]).cumsum(dim=-1)
     before = prior.scores[asked][..., None]
     return torch.cat([before, before + added], dim=-1)
+
+
+class CorrectedScores:
+    """Where2Act-adaptation."""
+
+    def __init__(self, network: Where2ActAdaptation, prior: FrozenPrior, dataset: Dataset) -> None:
+        self._network, self._prior, self._dataset = network, prior, dataset
+
+    @torch.no_grad()
+    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
+        """s_u + sum (r - s) sim_pq, cut to [0, 1]."""
+        if not len(tries):
+            return self._prior.scores[asked]
+        corrected = corrected_scores(self._network, self._dataset, self._prior, asked[None], tries[None])
+        return corrected[0, :, -1].clamp(0.0, 1.0)
+
+
+def _train(recipe: Recipe, config: AdaptationConfig) -> TrainingResult:
+    network = recipe.policy.baseline(NAME, Where2ActAdaptation).requires_grad_(True)
+    prior = FrozenPrior.of(recipe.policy.prior, recipe.known)
+    return recipe.runner.train(AdaptationStage(network, recipe.dataset, recipe.parts, config, prior), config, NAME)
+
+
+def _row_critic(policy: Policy, known: FrozenFeatures) -> CorrectedScores:
+    network = policy.baseline(NAME, Where2ActAdaptation)
+    return CorrectedScores(network, FrozenPrior.of(policy.prior, known), known.dataset)
+
+
+def _load(config: AdaptationConfig) -> Load:
+    return Load(0, config.batch_rollouts * config.rows_per_rollout * config.context, 0)
+
+
+TRAINING = BaselineTraining(AdaptationConfig, _train, _row_critic, _load, table="adaptation")

@@ -10,17 +10,22 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
+from learner.affordance import AapCritic
 from learner.augmentation import draw_turns
 from learner.configuration import InteractionConfig
+from learner.critics import AdaptiveScores
 from learner.data import Dataset, Split
-from learner.frozen import FrozenPrior
+from learner.features import FrozenFeatures
+from learner.frozen import FrozenAap, FrozenPrior
 from learner.losses import action_scoring_loss
 from learner.metrics import discrimination_in_chunks
+from learner.recipes import BaselineTraining, Load, Recipe
 from learner.sampling import Batch, OrderedRows, draw_numbers, padded, spread
 from learner.sharing import share
-from learner.training import ParameterGroup, StepResult
+from learner.training import ParameterGroup, StepResult, TrainingResult
 from shared.fps import actionable_points, distances_to
-from shared.networks.where2act_interaction import TRIES, Where2ActInteraction
+from shared.networks.where2act_interaction import NAME, TRIES, Where2ActInteraction
+from shared.policy import Policy
 from shared.vocabulary import Float, Float32
 
 LEAST_ROWS = 2 * TRIES
@@ -38,7 +43,7 @@ class InteractionStage:
     actionable; all other rows are predicted.
     """
 
-    name = "where2act-interaction"
+    name = NAME
 
     def __init__(
         self,
@@ -129,3 +134,27 @@ def spread_over(places: Float, actionability: Float32, count: int, rng: np.rando
         distances[np.isin(among, chosen)] = -1.0
         chosen.append(int(among[distances.argmax()]))
     return np.array(chosen, dtype=np.int64)
+
+
+def _train(recipe: Recipe, config: InteractionConfig) -> TrainingResult:
+    network = recipe.policy.baseline(NAME, Where2ActInteraction).requires_grad_(True)
+    pool, prior = recipe.pool(), FrozenPrior.of(recipe.policy.prior, recipe.known)
+    stage = InteractionStage(network, recipe.dataset, recipe.parts, config, prior)
+    result = recipe.runner.train(stage, config, NAME)
+    frozen = FrozenAap.of(network, recipe.known)
+    # The mean of all proposals' scores, as Where2Act has it, and not of the best.
+    critic = AapCritic(frozen, config.affordance.proposals)
+    settings = config.affordance.model_copy(update={"context": TRIES})
+    affordance = recipe.affordance(NAME, critic, settings, pool, frozen, stage.order, TRIES)
+    return recipe.runner.train_affordance(affordance, settings, result)
+
+
+def _row_critic(policy: Policy, known: FrozenFeatures) -> AdaptiveScores:
+    return AdaptiveScores(FrozenAap.of(policy.baseline(NAME, Where2ActInteraction), known), known.dataset)
+
+
+def _load(config: InteractionConfig) -> Load:
+    return Load(config.batch_rollouts, config.batch_rollouts * config.rows_per_rollout * (TRIES + 1), 1)
+
+
+TRAINING = BaselineTraining(InteractionConfig, _train, _row_critic, _load, table="interaction")

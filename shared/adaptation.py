@@ -9,7 +9,6 @@ Shapes: N points of a cloud, A actions, S proposals at a point.
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from torch import Tensor
 from shared.errors import UsageError
 from shared.geometry import gripper_rotation, points_in_view, view_from_world
 from shared.grouping import group_cloud, nearest_points
+from shared.methods import ModuleName
 from shared.networks.aap import Aap
 from shared.networks.actions import middle_of
 from shared.networks.pointnet2 import CloudBatch, EncodedClouds, PointNet2
@@ -28,10 +28,6 @@ from shared.vocabulary import Action, Float, Float32, Interaction, Observation
 PROPOSALS = 100
 """Actions sampled at a point (AdaAfford, Next-step Interaction Action Proposal)."""
 MAX_CACHED_OBSERVATIONS = 64
-
-AdaptiveName = Literal["aap", "where2act-interaction"]
-"""Modules that encode a history into z, and score under it."""
-EncoderName = Literal["prior", "aip", AdaptiveName]
 
 
 @dataclass(slots=True)
@@ -75,7 +71,7 @@ class Adapter:
         policy.modules().eval()
         self._entries: OrderedDict[int, _Entry] = OrderedDict()
 
-    def encode(self, observation: Observation, module: EncoderName = "aap") -> EncodedClouds:
+    def encode(self, observation: Observation, module: ModuleName = "aap") -> EncodedClouds:
         """The observation's cloud under a module's encoder, computed once."""
         entry = self._entry(observation)
         if module not in entry.encoded:
@@ -84,7 +80,7 @@ class Adapter:
         return entry.encoded[module]
 
     @torch.inference_mode()
-    def z(self, history: Sequence[Interaction], module: AdaptiveName = "aap") -> Tensor:
+    def z(self, history: Sequence[Interaction], module: ModuleName = "aap") -> Tensor:
         """The hidden information in a history, [latent_width]; order does not matter, and none is allowed."""
         latent = self.policy.config.latent_width
         codes, weights = torch.zeros(0, latent), torch.zeros(0)
@@ -98,7 +94,7 @@ class Adapter:
         self,
         observation: Observation,
         history: Sequence[Interaction],
-        module: AdaptiveName = "aap",
+        module: ModuleName = "aap",
         points: NDArray[np.int64] | None = None,
     ) -> Float32:
         """A_I: the AAP actionability after a history, in [0, 1], of every point, [N], or of those at `points` alone."""
@@ -119,7 +115,7 @@ class Adapter:
         observation: Observation,
         actions: Sequence[Action],
         history: Sequence[Interaction],
-        module: AdaptiveName = "aap",
+        module: ModuleName = "aap",
     ) -> Float32:
         """The AAP scores s_u|z of actions after a history, [A], in [0, 1]."""
         indices = point_indices(actions)
@@ -137,7 +133,7 @@ class Adapter:
         return torch.sigmoid(self.policy.prior.action_logits(features, points, frames)).numpy()
 
     @torch.inference_mode()
-    def features(self, observation: Observation, module: EncoderName, points: NDArray[np.int64]) -> Tensor:
+    def features(self, observation: Observation, module: ModuleName, points: NDArray[np.int64]) -> Tensor:
         """All that a module knows of points, [len(points), point_width]."""
         index, entry = torch.from_numpy(points), self._entry(observation)
         features = self._encoder(module).features_at(self.encode(observation, module), torch.zeros_like(index), index)
@@ -159,7 +155,7 @@ class Adapter:
 
     @torch.inference_mode()
     def score_proposals(
-        self, observation: Observation, proposals: Proposals, latent: Tensor, module: AdaptiveName = "aap"
+        self, observation: Observation, proposals: Proposals, latent: Tensor, module: ModuleName = "aap"
     ) -> Tensor:
         """The AAP scores s_u|z of proposals, [S]."""
         index = np.array([proposals.point])
@@ -204,14 +200,14 @@ class Adapter:
         self._entries.move_to_end(id(observation))
         return entry
 
-    def _adaptive(self, module: AdaptiveName) -> Aap:
+    def _adaptive(self, module: ModuleName) -> Aap:
+        """A network that encodes a history into z, and scores under it."""
         if module == "aap":
             return self.policy.aap
         self.policy.require(module)
-        assert self.policy.where2act_interaction is not None, "a trained module is there"
-        return self.policy.where2act_interaction
+        return self.policy.baseline(module, Aap)
 
-    def _encoder(self, module: EncoderName) -> PointNet2:
+    def _encoder(self, module: ModuleName) -> PointNet2:
         match module:
             case "prior":
                 return self.policy.prior.encoder
@@ -220,7 +216,7 @@ class Adapter:
             case _:
                 return self._adaptive(module).encoder
 
-    def _interaction_code(self, interaction: Interaction, module: AdaptiveName) -> tuple[Tensor, Tensor]:
+    def _interaction_code(self, interaction: Interaction, module: ModuleName) -> tuple[Tensor, Tensor]:
         index = np.array([interaction.action.point_index])
         return self._adaptive(module).interaction_codes(
             self.features(interaction.observation, module, index),

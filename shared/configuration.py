@@ -21,7 +21,8 @@ MAX_DOTS = 100
 
 Collision = Literal["hulls", "decomposed"]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")]
-"""Of something that a registry finds (`shared.extensions`); a store can be read where the package is not installed."""
+"""Of something that a registry finds (`shared.extensions`); it stands in flags, file names and keys of plans. A store
+can be read where the package is not installed."""
 PANDA, SAPIEN = "panda", "sapien"
 
 
@@ -252,6 +253,9 @@ def parse(model: type[Model], values: dict[str, Any], source: str) -> Model:
     try:
         return model.model_validate(values)
     except ValidationError as error:
+        cause = error.errors()[0].get("ctx", {}).get("error") if error.error_count() == 1 else None
+        if isinstance(cause, UsageError):
+            raise cause from None  # It names the file itself.
         raise UsageError(f"{source}: {_first_problem(model, error)}") from None
 
 

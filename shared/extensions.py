@@ -21,10 +21,11 @@ class Registry(Generic[Item]):
     Args:
         kind: what messages call one of them, such as "primitive".
         of: the class that an entry point must name an instance of.
-        built_in: this project's own, which no package can replace.
+        built_in: this project's own, which no package can replace. One that is given as "module:attribute" is imported
+            when it is first wanted.
     """
 
-    def __init__(self, kind: str, of: type[Item], built_in: Mapping[str, Item]) -> None:
+    def __init__(self, kind: str, of: type[Item], built_in: Mapping[str, Item | str]) -> None:
         self.kind, self.group = kind, f"adaafford.{kind.replace(' ', '_')}s"
         self._of = of
         self._built_in = dict(built_in)
@@ -40,8 +41,11 @@ class Registry(Generic[Item]):
         Raises:
             UsageError: there is none, several packages add one, or the package that adds it cannot be imported.
         """
-        if name in self._built_in:
-            return self._built_in[name]
+        ours = self._built_in.get(name)
+        if isinstance(ours, self._of):
+            return ours
+        if name not in self._loaded and isinstance(ours, str):
+            self._loaded[name] = self._load(EntryPoint(name, ours, self.group))
         if name not in self._loaded:
             entries = self._foreign()
             if name not in entries:

@@ -7,14 +7,14 @@ Shapes: C points that may be tried, K tries.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.adaptation import Adapter, movable_points
 from shared.critics import best_action, critic_named
-from shared.methods import CriticName
+from shared.methods import CriticName, ProposerKind
 from shared.vocabulary import Action, Float, Float32, Interaction, Observation
 
 THRESHOLD = 0.5
@@ -105,9 +105,10 @@ class WeightedFpsProposer(FpsProposer):
         return int((actionability if spread is None else spread * actionability).argmax())
 
 
-FPS_PROPOSERS: Mapping[str, type[FpsProposer]] = {
-    kind.name: kind for kind in (ActionableFpsProposer, PureFpsProposer, WeightedFpsProposer, Where2ActFpsProposer)
-}
+FPS = ProposerKind(lambda adapter, rng, budget: ActionableFpsProposer(adapter, rng), ("prior", "aap"))
+PURE_FPS = ProposerKind(lambda adapter, rng, budget: PureFpsProposer(adapter, rng), ("prior", "aap"))
+WEIGHTED_FPS = ProposerKind(lambda adapter, rng, budget: WeightedFpsProposer(adapter, rng), ("prior", "aap"))
+WHERE2ACT_FPS = ProposerKind(lambda adapter, rng, budget: Where2ActFpsProposer(adapter, rng), ("prior",))
 
 
 def distances_to(points: Float, tried: Float) -> Float | None:

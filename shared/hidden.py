@@ -15,7 +15,8 @@ from shared.errors import UsageError
 from shared.extensions import Registry
 
 NAME = r"^[a-z][a-z0-9_]{0,39}$"
-_RESERVED = ("direction", "values")
+RESERVED = ("direction", "values")
+"""What `HiddenDynamics` and columns call something else."""
 
 
 class HiddenTarget(Protocol):
@@ -71,7 +72,7 @@ class HiddenParameter:
 
     def __post_init__(self) -> None:
         """Refuse a record that no setting could hold."""
-        if not re.fullmatch(NAME, self.name) or self.name in ("direction", "values"):
+        if not re.fullmatch(NAME, self.name) or self.name in RESERVED:
             raise ValueError(
                 f"a hidden parameter cannot be called '{self.name}'; allowed: {NAME}, not direction or values"
             )

@@ -1,34 +1,95 @@
 """The methods that are compared: who fills the set of interactions, who acts on it, and with which policy.
 
-They share one loop and differ in one thing each (AdaAfford, Baselines and Ablation Study, and its supplement).
+They share one loop and differ in one thing each (AdaAfford, Baselines and Ablation Study, and its supplement). Methods
+and what they consist of are found by name: ours, and what packages add by entry points (docs/extending.md). Ours are
+named by their place here, so that this module, which every command imports, needs no network.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from shared.configuration import Name
 from shared.errors import UsageError
+from shared.extensions import Registry
+from shared.vocabulary import Proposer
 
-BaselineName = Literal["where2act-interaction", "where2act-adaptation"]
-"""Baselines with a network of their own, which are trained only where they are wanted."""
-CriticName = Literal["where2act", "aap", BaselineName]
-ModuleName = Literal["prior", "aap", "aip", BaselineName]
-"""Networks that a policy may hold."""
-TriesName = Literal["random", "aip", "fps", "purefps", "argfps", "where2act-fps"]
-MethodName = Literal[
-    "where2act",
-    "where2act-interaction",
-    "where2act-adaptation",
-    "ours-random",
-    "ours-purefps",
-    "ours-argfps",
-    "ours-fps",
-    "ours-no-iteration",
-    "ours-final",
-]
+if TYPE_CHECKING:
+    from torch import nn
 
+    from shared.adaptation import Adapter
+    from shared.critics import Critic
+    from shared.networks.configuration import NetworkConfig
+    from shared.networks.prior import Prior
+
+MethodName = Name
+BaselineName = Name
+CriticName = Name
+"""Of whose beliefs count: where2act, aap, or a baseline."""
+ModuleName = Name
+"""Of a network that a policy may hold: prior, aap, aip, or a baseline."""
+
+RANDOM = "random"
+"""The proposer that needs no policy, and that everything is compared with."""
 FIRST_VERSION = 1
 """The policy of the first round of the alternation."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProposerKind:
+    """A kind of proposer.
+
+    Attributes:
+        make: makes one of an `Adapter`, a random generator and the most tries that it may propose; where it needs no
+            networks, there may be None in place of the adapter.
+        modules: the networks that it needs; none: it proposes without a policy.
+    """
+
+    make: Callable[[Any, np.random.Generator, int], Proposer]
+    modules: tuple[ModuleName, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """A network that is compared with AAP, and is trained only where a method wants it.
+
+    Attributes:
+        network: makes the network, whatever its weights.
+        critic: what a history of tries makes it believe; of an adapter whose policy holds the trained network.
+        training: "module:attribute" of its `learner.recipes.BaselineTraining`. Only the learner imports that, since a
+            robot that carries the network does not train it.
+        begin: makes the network as it is before training, from a trained prior; None: as `network` does.
+        needs: networks that are trained before it; the last of them is the stage to start from.
+    """
+
+    network: "Callable[[NetworkConfig], nn.Module]"
+    critic: "Callable[[Adapter], Critic]"
+    training: str
+    begin: "Callable[[Prior], nn.Module] | None" = None
+    needs: tuple[ModuleName, ...] = ("prior",)
+
+
+PROPOSERS = Registry(
+    "proposer",
+    ProposerKind,
+    {
+        "aip": "shared.proposers:AIP",
+        "fps": "shared.fps:FPS",
+        "purefps": "shared.fps:PURE_FPS",
+        "argfps": "shared.fps:WEIGHTED_FPS",
+        "where2act-fps": "shared.fps:WHERE2ACT_FPS",
+    },
+)
+BASELINES = Registry(
+    "baseline",
+    Baseline,
+    {
+        "where2act-interaction": "shared.networks.where2act_interaction:BASELINE",
+        "where2act-adaptation": "shared.networks.where2act_adaptation:BASELINE",
+    },
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +103,7 @@ class Method:
         version: the policy version that it uses; None: the one that is evaluated.
     """
 
-    tries: TriesName | None
+    tries: Name | None
     critic: CriticName
     in_one_shot: int | None = None
     version: int | None = None
@@ -54,49 +115,59 @@ class Method:
     @property
     def modules(self) -> tuple[ModuleName, ...]:
         """The networks that it needs, each once; the prior's proposals serve all."""
-        wanted: list[ModuleName] = ["prior"]
-        if self.critic != "where2act":
-            wanted.append(self.critic)
-        if self.tries in ("aip", "argfps", "fps"):
-            wanted += ["aap", "aip"] if self.tries == "aip" else ["aap"]
-        return tuple(dict.fromkeys(wanted))
+        own = () if self.critic == "where2act" else (self.critic,)
+        tried_by = () if self.tries is None or self.tries == RANDOM else PROPOSERS.get(self.tries).modules
+        return tuple(dict.fromkeys(("prior", *own, *tried_by)))
 
     def policy_version(self, evaluated: int) -> int:
         """The policy version that it uses where version `evaluated` is evaluated."""
         return evaluated if self.version is None else min(self.version, evaluated)
 
 
-METHODS: Mapping[MethodName, Method] = {
-    "where2act": Method(None, "where2act"),
-    "where2act-interaction": Method("where2act-fps", "where2act-interaction", in_one_shot=4),
-    "where2act-adaptation": Method("where2act-fps", "where2act-adaptation"),
-    "ours-random": Method("random", "aap"),
-    "ours-purefps": Method("purefps", "aap"),
-    "ours-argfps": Method("argfps", "aap"),
-    "ours-fps": Method("fps", "aap"),
-    "ours-no-iteration": Method("aip", "aap", version=FIRST_VERSION),
-    "ours-final": Method("aip", "aap"),
-}
+METHODS: Registry[Method] = Registry(
+    "method",
+    Method,
+    {
+        "where2act": Method(None, "where2act"),
+        "where2act-interaction": "shared.networks.where2act_interaction:METHOD",
+        "where2act-adaptation": "shared.networks.where2act_adaptation:METHOD",
+        "ours-random": Method("random", "aap"),
+        "ours-purefps": Method("purefps", "aap"),
+        "ours-argfps": Method("argfps", "aap"),
+        "ours-fps": Method("fps", "aap"),
+        "ours-no-iteration": Method("aip", "aap", version=FIRST_VERSION),
+        "ours-final": Method("aip", "aap"),
+    },
+)
+"""In the order of the paper's table."""
 
 
-def method_named(name: str) -> Method:
+def method_named(name: MethodName) -> Method:
     """The method called `name`.
 
     Raises:
         UsageError: there is no such method; the message lists those there are.
     """
-    for known, method in METHODS.items():
-        if name == known:
-            return method
-    raise UsageError(f"unknown method '{name}'; allowed: {', '.join(METHODS)}")
+    return METHODS.get(name)
+
+
+def needs_policy(proposer: Name) -> bool:
+    """Whether a proposer uses networks.
+
+    Raises:
+        UsageError: there is no such proposer; the message lists those there are.
+    """
+    if proposer != RANDOM and proposer not in PROPOSERS.names():
+        raise UsageError(f"unknown proposer '{proposer}'; allowed: {', '.join((RANDOM, *PROPOSERS.names()))}")
+    return proposer != RANDOM and bool(PROPOSERS.get(proposer).modules)
 
 
 def baselines_of(methods: Sequence[MethodName]) -> list[BaselineName]:
     """The networks of their own that methods need, each once."""
-    wanted = {METHODS[name].critic for name in methods}
-    return [name for name in get_args(BaselineName) if name in wanted]
+    wanted = {METHODS.get(name).critic for name in methods}
+    return [name for name in BASELINES.names() if name in wanted]
 
 
 def versions_of(methods: Sequence[MethodName], evaluated: int) -> list[int]:
     """The policy versions that methods use where version `evaluated` is evaluated, which is one of them."""
-    return sorted({METHODS[name].policy_version(evaluated) for name in methods} | {evaluated})
+    return sorted({METHODS.get(name).policy_version(evaluated) for name in methods} | {evaluated})

@@ -6,13 +6,14 @@ range of a plan's rollouts and makes one *shard*. Nothing here knows who does th
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import FailFast, Field
+from pydantic import FailFast, Field, model_validator
 
 from shared.configuration import CollectionConfig, DynamicsRanges, StrictModel
-from shared.methods import MethodName
-from shared.tasks import Terms, task_named
+from shared.extensions import Registry
+from shared.methods import BASELINES, METHODS, PROPOSERS, RANDOM, MethodName
+from shared.tasks import TASKS, Task, Terms, task_named
 
 
 class ObjectRef(StrictModel):
@@ -54,6 +55,8 @@ class Setting(StrictModel):
 
     kind: Literal["collection", "evaluation"] = "collection"
     task: str
+    task_definition: Task | None = Field(None, exclude_if=lambda task: task is None)
+    """The task itself where a file defined it, so that a store says all that was decided; None: found by its name."""
     seed: int = Field(ge=0)
     objects: Annotated[tuple[ObjectRef, ...], FailFast(), Field(min_length=1)]
     collection: CollectionConfig
@@ -61,6 +64,21 @@ class Setting(StrictModel):
     extensions: tuple[str, ...] = Field((), exclude_if=lambda added: not added)
     """What other packages add of what the setting uses, such as "primitive twist: my-package 1.2"; documents leave it
     out where there is nothing (see `shared.extensions.added_by_packages`)."""
+
+    @model_validator(mode="after")
+    def _one_task(self) -> "Setting":
+        if self.task_definition is not None and self.task_definition.name != self.task:
+            raise ValueError(f"the task is '{self.task}', but '{self.task_definition.name}' is defined")
+        return self
+
+    @property
+    def task_record(self) -> Task:
+        """The task.
+
+        Raises:
+            UsageError: there is no such task; the package that adds it may not be installed.
+        """
+        return self.task_definition or task_named(self.task)
 
     @property
     def identities(self) -> frozenset[tuple[str, str, str]]:
@@ -79,7 +97,18 @@ class Setting(StrictModel):
         Raises:
             UsageError: there is no such task.
         """
-        return task_named(self.task).terms(self.collection)
+        return self.task_record.terms(self.collection)
+
+
+def found_by_name(task: Task, evaluation: EvaluationConfig | None) -> list[tuple[Registry[Any], str]]:
+    """The task, methods, proposers and baselines that a setting uses, each with the registry that knows it."""
+    used: list[tuple[Registry[Any], str]] = [(TASKS, task.name)] if task.name in TASKS.names() else []
+    for name in () if evaluation is None else evaluation.methods:
+        method = METHODS.get(name)
+        used.append((METHODS, name))
+        used += [(PROPOSERS, method.tries)] if method.tries is not None and method.tries != RANDOM else []
+        used += [(BASELINES, method.critic)] if method.critic in BASELINES.names() else []
+    return list(dict.fromkeys(used))
 
 
 class Plan(StrictModel):

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from pydantic import Field
@@ -13,13 +13,11 @@ from torch import Tensor, nn
 from shared.configuration import StrictModel
 from shared.documents import parse_document, parse_object
 from shared.errors import StoreError, UsageError
-from shared.methods import BaselineName, ModuleName
+from shared.methods import BASELINES, BaselineName, ModuleName
 from shared.networks.aap import Aap
 from shared.networks.aip import Aip
 from shared.networks.configuration import NetworkConfig
 from shared.networks.prior import Prior
-from shared.networks.where2act_adaptation import Where2ActAdaptation
-from shared.networks.where2act_interaction import Where2ActInteraction
 from shared.plain import MAX_WORD, plain
 
 WEIGHTS_FILE = "weights.safetensors"
@@ -32,6 +30,8 @@ MAX_HEADER_BYTES = 1 << 22
 MAX_PARAMETERS = 1 << 26
 METADATA = "__metadata__"
 """Of a file of tensors: texts by name."""
+CORE: tuple[ModuleName, ...] = ("prior", "aap", "aip")
+"""The networks of every policy."""
 _KINDS = {torch.float32: "F32", torch.float16: "F16", torch.int64: "I64"}
 
 
@@ -42,8 +42,11 @@ class PolicyDocument(StrictModel):
     schema_version: int = POLICY_SCHEMA
     task: str = Field(max_length=100)
     network: NetworkConfig
-    trained: tuple[ModuleName, ...]
+    trained: tuple[ModuleName, ...] = Field(max_length=100)
     weights_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 class Policy:
@@ -55,8 +58,7 @@ class Policy:
         prior: Where2Act.
         aap: Adaptive Affordance Prediction.
         aip: Adaptive Interaction Proposal.
-        where2act_interaction: the baseline of that name; None until it is begun.
-        where2act_adaptation: the baseline of that name; None until it is begun.
+        baselines: networks of baselines that were begun, by name.
         trained: which modules have been trained; the others hold their first weights.
 
     Example:
@@ -71,8 +73,9 @@ class Policy:
         self.prior = Prior(config)
         self.aap = Aap(config)
         self.aip = Aip(config)
-        self.where2act_interaction = Where2ActInteraction(config) if "where2act-interaction" in trained else None
-        self.where2act_adaptation = Where2ActAdaptation(config) if "where2act-adaptation" in trained else None
+        self.baselines: dict[BaselineName, nn.Module] = {
+            name: BASELINES.get(name).network(config) for name in sorted(trained.difference(CORE))
+        }
 
     @classmethod
     def untrained(cls, task: str, config: NetworkConfig, seed: int) -> "Policy":
@@ -84,26 +87,26 @@ class Policy:
 
     def begin_baseline(self, name: BaselineName, seed: int) -> None:
         """Make a learnt baseline anew, as it is before training; `seed` as for `untrained`."""
+        baseline = BASELINES.get(name)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            if name == "where2act-interaction":
-                self.where2act_interaction = Where2ActInteraction.starting_from(self.prior)
-            else:
-                self.where2act_adaptation = Where2ActAdaptation(self.config)
+            begun = baseline.begin(self.prior) if baseline.begin is not None else baseline.network(self.config)
+        self.baselines[name] = begun
+
+    def baseline(self, name: BaselineName, kind: type[Module]) -> Module:
+        """The network of a baseline that was begun."""
+        network = self.baselines[name]
+        assert isinstance(network, kind), f"{name} is no {kind.__name__}"
+        return network
 
     def modules(self) -> nn.ModuleDict:
         """The modules that there are, by name."""
-        modules: dict[str, nn.Module] = {"prior": self.prior, "aap": self.aap, "aip": self.aip}
-        if self.where2act_interaction is not None:
-            modules["where2act-interaction"] = self.where2act_interaction
-        if self.where2act_adaptation is not None:
-            modules["where2act-adaptation"] = self.where2act_adaptation
-        return nn.ModuleDict(modules)
+        return nn.ModuleDict({"prior": self.prior, "aap": self.aap, "aip": self.aip, **self.baselines})
 
     def without_baselines(self) -> "Policy":
         """A policy of the same prior, AAP and AIP, and of nothing that only an evaluation asks for."""
         with torch.device("meta"):
-            kept = Policy(self.task, self.config, self.trained & {"prior", "aap", "aip"})
+            kept = Policy(self.task, self.config, self.trained.intersection(CORE))
         kept.prior, kept.aap, kept.aip = self.prior, self.aap, self.aip
         return kept
 
@@ -158,6 +161,9 @@ class Policy:
             raise StoreError(f"policy: {WEIGHTS_FILE} is missing or larger than {MAX_WEIGHTS_BYTES} bytes")
         if hashlib.sha256(weights).hexdigest() != document.weights_sha256:
             raise StoreError(f"policy: the SHA-256 of {WEIGHTS_FILE} is not that of {POLICY_FILE}; publish it again")
+        known = {*CORE, *BASELINES.names()}
+        if unknown := sorted(set(document.trained) - known):
+            raise StoreError(f"policy: has the network '{unknown[0]}'; install the package that adds this baseline")
         # On the meta device nothing is allocated, so that absurd sizes cost nothing before they are refused.
         with torch.device("meta"):
             policy = cls(document.task, document.network, frozenset(document.trained))

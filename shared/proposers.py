@@ -4,15 +4,13 @@ Everything here runs on the CPU in a few milliseconds a step and depends on its 
 """
 
 from collections.abc import Sequence
-from typing import get_args
 
 import numpy as np
 
 from shared.adaptation import Adapter, action_from_frame, movable_points
-from shared.critics import best_action, critic_named
+from shared.critics import best_action, critic_named, critic_names
 from shared.errors import UsageError
-from shared.fps import FPS_PROPOSERS
-from shared.methods import CriticName
+from shared.methods import PROPOSERS, CriticName, ProposerKind
 from shared.vocabulary import Action, Interaction, Observation, Proposer
 
 TOP_POINTS = 100
@@ -64,6 +62,9 @@ class AipProposer:
         return action_from_frame(observation, point, proposals.frames[best])
 
 
+AIP = ProposerKind(AipProposer, ("prior", "aap", "aip"))
+
+
 class ExploitProposer:
     """The action that a critic believes in most (AdaAfford, Evaluation Metrics, sample-success).
 
@@ -87,24 +88,24 @@ class ExploitProposer:
         return best_action(self.critic, self.adapter, observation, point, history, self.rng)
 
 
-def proposer_named(name: str, adapter: Adapter, rng: np.random.Generator, budget: int) -> Proposer:
-    """The proposer of a policy that rows call `name`.
+def proposer_named(name: str, adapter: Adapter | None, rng: np.random.Generator, budget: int) -> Proposer:
+    """The proposer that rows call `name`.
 
     Args:
-        name: "aip", of furthest-point sampling (see `shared.fps`), or a critic's, to exploit what it believes.
-        adapter: the policy.
+        name: one of `shared.methods.PROPOSERS`, or a critic's, to exploit what it believes.
+        adapter: the policy; None where the proposer needs none.
         rng: draws what it draws.
-        budget: how many tries AIP may propose.
+        budget: how many tries it may propose.
 
     Raises:
         UsageError: there is none of that name, or the networks that it needs are not trained.
     """
-    if name == AipProposer.name:
-        return AipProposer(adapter, rng, budget)
-    if name in FPS_PROPOSERS:
-        return FPS_PROPOSERS[name](adapter, rng)
-    for critic in get_args(CriticName):
-        if name == critic:
-            return ExploitProposer(adapter, rng, critic)
-    known = ", ".join((AipProposer.name, *FPS_PROPOSERS, *get_args(CriticName)))
+    if name in PROPOSERS.names():
+        kind = PROPOSERS.get(name)
+        if adapter is not None:
+            adapter.policy.require(*kind.modules)
+        return kind.make(adapter, rng, budget)
+    if name in critic_names() and adapter is not None:
+        return ExploitProposer(adapter, rng, name)
+    known = ", ".join((*PROPOSERS.names(), *critic_names()))
     raise UsageError(f"no proposer is called '{name}'; allowed: {known}")

@@ -1,10 +1,24 @@
-"""The paper's tasks: which primitive, on which parts, from which states, under which hidden dynamics."""
+"""Tasks: which primitive, on which parts, from which states, under which hidden dynamics.
+
+The paper's tasks are built in. Packages add others by entry points of the group "adaafford.tasks", and a TOML file that
+is named on the command line defines one of its own (docs/extending.md).
+"""
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-from shared.configuration import CollectionConfig, DynamicsRanges
+from pydantic import Field
+
+from shared.configuration import CollectionConfig, DynamicsRanges, Name, StrictModel, load_toml, parse
 from shared.errors import UsageError
+from shared.extensions import Registry
 from shared.vocabulary import Direction
+
+Word = Annotated[str, Field(min_length=1, max_length=64)]
+Words = Annotated[tuple[Word, ...], Field(max_length=1000)]
+TASK_FILE_SUFFIX = ".toml"
+"""What tells a file that defines a task from the name of one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,32 +36,28 @@ class Terms:
     edge_share: float
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One manipulation task.
+class Task(StrictModel):
+    """One manipulation task."""
 
-    Attributes:
-        name: what flags and rows call it.
-        primitive: name of the gripper primitive that it executes.
-        categories: the only categories that it applies to; empty: all.
-        part_names: a movable part qualifies if its semantic name contains one of these; empty: all.
-        revolute_only: whether only turning joints qualify.
-        closed: whether every joint starts at its lower limit, instead of the published mixture of states.
-        directions: the modes that a rollout's `HiddenDynamics.direction` is drawn from.
-        dynamics: ranges of the hidden dynamics.
-        edge_share: share of random actions at points near a part's edge. As published it is 0 throughout; most pulls in
-            the middle of a panel pinch nothing, so that half of them there doubles the positives.
-    """
-
-    name: str
-    primitive: str
-    categories: tuple[str, ...] = ()
-    part_names: tuple[str, ...] = ()
+    name: Name
+    """What flags and rows call it."""
+    primitive: Name
+    """Name of the primitive that the gripper executes."""
+    categories: Words = ()
+    """The only categories that it applies to; empty: all."""
+    part_names: Words = ()
+    """A movable part qualifies if its semantic name contains one of these; empty: all."""
     revolute_only: bool = False
+    """Whether only turning joints qualify."""
     closed: bool = False
-    directions: tuple[Direction, ...] = (Direction.AS_BUILT,)
+    """Whether every joint starts at its lower limit, instead of the published mixture of states."""
+    directions: Annotated[tuple[Direction, ...], Field(min_length=1, max_length=16)] = (Direction.AS_BUILT,)
+    """The modes that a rollout's `HiddenDynamics.direction` is drawn from."""
     dynamics: DynamicsRanges = DynamicsRanges()
-    edge_share: float = 0.0
+    """Ranges of the hidden dynamics."""
+    edge_share: float = Field(0.0, ge=0, le=1)
+    """Share of random actions at points near a part's edge. As published it is 0 throughout; most pulls in the middle
+    of a panel pinch nothing, so that half of them there doubles the positives."""
 
     def terms(self, collection: CollectionConfig) -> Terms:
         """What holds under `collection`, which may leave some of it to the task."""
@@ -75,31 +85,36 @@ class Task:
         )
 
 
-TASKS = {
-    task.name: task
-    for task in (
-        Task("push", "push"),
-        Task("pull", "pull", edge_share=0.5),
-        Task(
-            "pull-closed-door",
-            "pull",
-            categories=("StorageFurniture", "Cabinet"),
-            part_names=("door",),
-            revolute_only=True,
-            closed=True,
-            edge_share=0.5,
-        ),
-        Task(
-            "push-faucet",
-            "push",
-            categories=("Faucet",),
-            part_names=("switch",),
-            revolute_only=True,
-            closed=True,
-            directions=(Direction.BOTH, Direction.CLOCKWISE, Direction.COUNTER_CLOCKWISE),
-        ),
-    )
-}
+TASKS = Registry(
+    "task",
+    Task,
+    {
+        task.name: task
+        for task in (
+            Task(name="push", primitive="push"),
+            Task(name="pull", primitive="pull", edge_share=0.5),
+            Task(
+                name="pull-closed-door",
+                primitive="pull",
+                categories=("StorageFurniture", "Cabinet"),
+                part_names=("door",),
+                revolute_only=True,
+                closed=True,
+                edge_share=0.5,
+            ),
+            Task(
+                name="push-faucet",
+                primitive="push",
+                categories=("Faucet",),
+                part_names=("switch",),
+                revolute_only=True,
+                closed=True,
+                directions=(Direction.BOTH, Direction.CLOCKWISE, Direction.COUNTER_CLOCKWISE),
+            ),
+        )
+    },
+)
+"""The paper's tasks, and those of other packages."""
 
 
 def task_named(name: str) -> Task:
@@ -108,6 +123,24 @@ def task_named(name: str) -> Task:
     Raises:
         UsageError: there is no such task; the message lists those there are.
     """
-    if name not in TASKS:
-        raise UsageError(f"unknown task '{name}'; allowed: {', '.join(TASKS)}")
-    return TASKS[name]
+    task = TASKS.get(name)
+    if task.name != name:
+        raise UsageError(f"{TASKS.package_of(name)}: the task '{name}' calls itself '{task.name}'; give both one name")
+    return task
+
+
+def task_of(told: str) -> Task:
+    """The task of a name, or of a TOML file; raises as `task_named` and `read_task`."""
+    return read_task(Path(told)) if told.endswith(TASK_FILE_SUFFIX) else task_named(told)
+
+
+def read_task(file: Path) -> Task:
+    """The task that a TOML file defines: a setting a line, as `Task` has them.
+
+    Raises:
+        UsageError: the file is missing, or a setting is missing, unknown or not allowed, or the name is taken.
+    """
+    task = parse(Task, load_toml(file), str(file))
+    if task.name in TASKS.names():
+        raise UsageError(f"{file}: there is already a task '{task.name}'; choose another name")
+    return task

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from collector.camera import EmbreeCamera
-from collector.partnet import read_object
+from collector.readers import read_object
 from collector.scene import Scene
 from shared.configuration import FIDELITIES, CameraConfig
 from shared.errors import ObjectError

@@ -64,11 +64,11 @@ def stage_of(name: BaselineName, dataset: Dataset, policy: Policy) -> Interactio
     policy.modules().requires_grad_(False)
     prior = FrozenPrior.of(policy.prior.eval(), FrozenFeatures(dataset))
     if name == "where2act-interaction":
-        assert policy.where2act_interaction is not None
-        network = policy.where2act_interaction.requires_grad_(True)
+        assert policy.baselines["where2act-interaction"] is not None
+        network = policy.baselines["where2act-interaction"].requires_grad_(True)
         return InteractionStage(network, dataset, EVERYTHING, InteractionConfig(batch_rollouts=8), prior)
-    assert policy.where2act_adaptation is not None
-    similarities = policy.where2act_adaptation.requires_grad_(True)
+    assert policy.baselines["where2act-adaptation"] is not None
+    similarities = policy.baselines["where2act-adaptation"].requires_grad_(True)
     return AdaptationStage(similarities, dataset, EVERYTHING, AdaptationConfig(batch_rollouts=8), prior)
 
 
@@ -160,7 +160,7 @@ def trained(folder: Path, dataset: Dataset) -> Path:
     """Folders of all stages, each starting from the one before."""
     before: Path | None = None
     for stage in ("prior", "aap", "aip", *BASELINES):
-        run_stage(StageJob(stage, folder / "store", folder / stage, before), ALL)  # type: ignore[arg-type]
+        run_stage(StageJob(stage, folder / "store", folder / stage, before), ALL)
         before = folder / stage
     return folder
 
@@ -193,14 +193,14 @@ def as_evaluation(rollout: RolloutRecord, methods: tuple[str, ...]) -> RolloutRe
     for place in range(4):
         add(place, Role.QUERY)
     for method in methods:
-        for place in range(4, 8) if METHODS[method].tries is not None else ():
+        for place in range(4, 8) if METHODS.get(method).tries is not None else ():
             add(place, Role.CONTEXT, method)
         add(8, Role.EXPLOIT, method, 4)
     return dataclasses.replace(rollout, interactions=tuple(rows))
 
 
 def test_the_table_has_a_row_for_every_method(trained: Path, tmp_path: Path) -> None:
-    plan, methods = fabricated_plan(), tuple(METHODS)
+    plan, methods = fabricated_plan(), tuple(METHODS.names())
     rollouts = [as_evaluation(rollout, methods) for rollout in fabricated_rollouts(plan, 3)]
     store = make_store(tmp_path / "store", rollouts, plan)
     final, first = read_policy_folder(trained / BASELINES[-1]), policy_with_all(seed=9)
@@ -210,10 +210,10 @@ def test_the_table_has_a_row_for_every_method(trained: Path, tmp_path: Path) -> 
     store.publish_policy(1, first.to_files())
     oracle = read_oracle(trained / "aap" / ORACLE_FILE, TINY)
     table = {(row.method, row.budget): row for row in evaluate_store(store, 2, (2, 4), oracle)}
-    adapted = [name for name in METHODS if name != PRIOR_METHOD]
+    adapted = [name for name in METHODS.names() if name != PRIOR_METHOD]
     assert list(table) == [
         *((name, 0) for name in (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD)),
-        *((name, budget) for name in adapted for budget in METHODS[name].budgets((2, 4))),
+        *((name, budget) for name in adapted for budget in METHODS.get(name).budgets((2, 4))),
     ]
     assert all(np.isfinite(row.bce) and row.queries == 12 for row in table.values())
     assert all(row.trials == 3 for (name, budget), row in table.items() if budget == 4)

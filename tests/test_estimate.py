@@ -38,7 +38,7 @@ def test_the_published_scale_is_the_published_one() -> None:
     train, validation, test = found.objects
     assert train + validation + test == pytest.approx(972, abs=5)
     assert stage(found, "collect-random").interactions == (train + validation) * 4 * 32
-    assert set(config.evaluation.methods) == set(METHODS)
+    assert set(config.evaluation.methods) == set(METHODS.names())
     assert config.learner.network == NETWORKS["published"]
     assert stage(found, "evaluate").interactions % (10 * test) == 0
 
@@ -53,7 +53,7 @@ def test_cost_grows_with_what_is_asked_for() -> None:
     exact = of(collection={"fidelity": {"name": "reference"}})
     assert stage(exact, "collect-random").core_s > 5 * stage(once, "collect-random").core_s
     assert stage(of(task="pull"), "collect-random").core_s > stage(once, "collect-random").core_s
-    some, all_methods = of(evaluation={"methods": ["where2act"]}), of(evaluation={"methods": list(METHODS)})
+    some, all_methods = of(evaluation={"methods": ["where2act"]}), of(evaluation={"methods": METHODS.names()})
     assert stage(all_methods, "evaluate").core_s > 3 * stage(some, "evaluate").core_s
 
 

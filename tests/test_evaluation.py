@@ -88,7 +88,7 @@ def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     assert "counts" not in read[0]
 
 
-@pytest.mark.parametrize("name", sorted(METHODS))
+@pytest.mark.parametrize("name", sorted(METHODS.names()))
 def test_a_method_needs_the_networks_that_its_proposers_check(name: str) -> None:
     """Asked too little, a worker would meet the missing network in the middle of a collection."""
     from shared.adaptation import Adapter
@@ -96,7 +96,7 @@ def test_a_method_needs_the_networks_that_its_proposers_check(name: str) -> None
     from shared.proposers import proposer_named
     from tests.finished_run import SMALL_NETWORK
 
-    method = METHODS[name]  # type: ignore[index]
+    method = METHODS.get(name)
     policy = Policy.untrained("push", SMALL_NETWORK, 0)
     for module in method.modules:
         if module in ("where2act-interaction", "where2act-adaptation"):
@@ -131,7 +131,7 @@ def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) 
 def row_of(method: str, budget: int, f_score: float) -> EvaluationRow:
     figures = dict.fromkeys((field.name for field in dataclasses.fields(EvaluationRow)), 0.5)
     told = {"method": method, "budget": budget, "f_score": f_score, "counts": ObjectCounts(*[()] * 9)}
-    return EvaluationRow(**figures | told)  # type: ignore[arg-type]
+    return EvaluationRow(**figures | told)
 
 
 def test_where2act_stands_at_every_budget_and_the_oracle_closes_the_gap(
@@ -198,7 +198,7 @@ def test_a_stopped_evaluation_ends_in_the_same_table(
         calls.append(args)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return execute(*args)  # type: ignore[arg-type]
+        return execute(*args)
 
     with monkeypatch.context() as patch, pytest.raises((KeyboardInterrupt, JobError)):
         patch.setattr(Worker, "execute", dying)

@@ -1,7 +1,6 @@
 """A hidden parameter of another package: drawn, applied, stored, digested, told to the oracle and reported."""
 
 import shutil
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -28,21 +27,22 @@ from learner.stages import StageJob, run_stage
 from shared.configuration import FIDELITIES, DynamicsRanges, Range
 from shared.errors import StoreError, UsageError
 from shared.geometry import gripper_rotation
-from shared.hidden import ALWAYS_DRAWN, HIDDEN_PARAMETERS, HiddenParameter
+from shared.hidden import ALWAYS_DRAWN, HiddenParameter
 from shared.plan import Job, Plan
+from shared.primitives import PRIMITIVES
 from shared.store import Store, compact, export, merge, repair, verify
 from shared.store.columns import ROLLOUT_COLUMNS, added_column
 from shared.store.export import splits_by_share
 from shared.store.tables import read_table
-from shared.vocabulary import Action, HiddenDynamics, Primitive
+from shared.vocabulary import Action, HiddenDynamics
+from tests.example_package import PACKAGE, install_here
 from tests.fabricate import fabricate_rollouts, fabricate_setting
 from tests.single_door import door, drawer
 from tests.test_compatibility import add_column, shards_of
 from tests.test_learner_training import FAST as TRAINING
 from tests.test_networks import TINY
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "plugin"
-FAST = FIDELITIES["fast"]
+FAST, PUSH = FIDELITIES["fast"], PRIMITIVES.get("push")
 NAME, COLUMN = "joint_damping", "hidden_joint_damping"
 OURS = {"part_mass": 0.5, "joint_friction": 0.0, "surface_friction": 1.0}
 COLLECT = (
@@ -52,27 +52,9 @@ COLLECT = (
 )
 
 
-def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the example package be found as if it were installed."""
-    distribution = folder / "adaafford_example-1.0.dist-info"
-    distribution.mkdir(parents=True)
-    (distribution / "METADATA").write_text("Metadata-Version: 2.1\nName: adaafford-example\nVersion: 1.0\n")
-    (distribution / "entry_points.txt").write_text(
-        f"[adaafford.hidden_parameters]\n{NAME} = adaafford_example.joint_damping:JOINT_DAMPING\n"
-    )
-    monkeypatch.setattr(sys, "path", [str(folder), str(EXAMPLE), *sys.path])
-    forget(monkeypatch)
-
-
-def forget(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What this process has loaded of packages is looked for again."""
-    monkeypatch.setattr(HIDDEN_PARAMETERS, "_loaded", {})
-    added_column.cache_clear()
-
-
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    install(tmp_path / "site", monkeypatch)
+    install_here(tmp_path / "site", monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +63,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("hidden")
     assert run([*COLLECT, "--store", str(folder / "plain")]) == 0
     with pytest.MonkeyPatch.context() as monkeypatch:
-        install(folder / "site", monkeypatch)
+        install_here(folder / "site", monkeypatch)
         assert run([*COLLECT, "--store", str(folder / "damped"), "--collection.dynamics", NAME]) == 0
     added_column.cache_clear()
     return folder / "plain", folder / "damped"
@@ -110,7 +92,7 @@ def with_values(rollout: Any, added: dict[str, float]) -> Any:
 @pytest.mark.parametrize("make", [drawer, door])
 def test_a_damped_joint_coasts_as_far_as_its_speed_over_the_rate(make: Any, installed: None) -> None:
     for rate in (2.0, 10.0):
-        scene = Scene(make(), HiddenDynamics(OURS, joint_damping=rate), FAST, Primitive.PUSH)
+        scene = Scene(make(), HiddenDynamics(OURS, joint_damping=rate), FAST, PUSH)
         scene.put(np.zeros(1))
         scene._articulation.set_qvel(np.array([0.4], dtype=np.float32))
         for _ in range(3 * FAST.approach.steps_per_second):
@@ -121,16 +103,16 @@ def test_a_damped_joint_coasts_as_far_as_its_speed_over_the_rate(make: Any, inst
 def test_the_more_a_joint_is_damped_the_less_the_same_push_moves_it(installed: None) -> None:
     motions = []
     for rate in (0.0, 1.0, 5.0, 20.0):
-        scene = Scene(drawer(), HiddenDynamics({**OURS, NAME: rate, "joint_friction": 0.05}), FAST, Primitive.PUSH)
+        scene = Scene(drawer(), HiddenDynamics({**OURS, NAME: rate, "joint_friction": 0.05}), FAST, PUSH)
         scene.put(np.zeros(1))
         action = Action(0, np.zeros(3), gripper_rotation(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])))
-        motions.append(Trial(scene, action, 1, Primitive.PUSH, FAST).run().motion)
+        motions.append(Trial(scene, action, 1, PUSH, FAST).run().motion)
     assert all(less < more for more, less in pairwise(motions)), motions
 
 
 def test_a_draw_of_a_package_that_is_not_installed_is_not_simulated() -> None:
     with pytest.raises(UsageError, match="unknown hidden parameter 'joint_damping'; allowed: part_mass,"):
-        Scene(drawer(), HiddenDynamics(OURS, joint_damping=1.0), FAST, Primitive.PUSH)
+        Scene(drawer(), HiddenDynamics(OURS, joint_damping=1.0), FAST, PUSH)
 
 
 # Collection and learning, the package being installed in the collection alone
@@ -151,6 +133,7 @@ def test_it_is_drawn_stored_and_digested_and_changes_no_draw_of_ours(stores: tup
     for name in (*ALWAYS_DRAWN, "direction", "azimuth_deg", "object_id"):
         assert known.column(name).to_pylist() == table.column(name).to_pylist(), name
     assert plain.digest() != damped.digest()
+    assert (plain.setting.extensions, damped.setting.extensions) == ((), (f"hidden parameter {NAME}: {PACKAGE}",))
     assert verify(plain) == verify(damped) == []
     rows = {row["rollout"]: row[COLUMN] for row in damped.interactions(["rollout", COLUMN]).to_pylist()}
     assert rows == {k: rate for k, rate in enumerate(rates) if k in rows}
@@ -162,7 +145,7 @@ def test_a_store_that_lacks_it_has_its_default(
     plain = Store.open(stores[0])
     with pytest.raises(UsageError, match=f"no column '{COLUMN}' in the interactions"):
         plain.interactions([COLUMN])
-    install(tmp_path / "site", monkeypatch)
+    install_here(tmp_path / "site", monkeypatch)
     assert set(plain.interactions(["success", COLUMN]).column(COLUMN).to_pylist()) == {0.0}
     assert COLUMN not in plain.interactions().column_names
 

@@ -20,9 +20,9 @@ from collector.preview import contact_sheet, part_colours, picture
 from shared.errors import ObjectError, UsageError
 from shared.plan import ObjectRef
 from shared.store import Store, verify
-from shared.tasks import TASKS
+from shared.tasks import task_named
 
-CLOSED_DOOR, FAUCET = TASKS["pull-closed-door"], TASKS["push-faucet"]
+CLOSED_DOOR, FAUCET = task_named("pull-closed-door"), task_named("push-faucet")
 
 
 @pytest.fixture(scope="module")
@@ -306,7 +306,7 @@ def test_what_is_left_out_is_said_before_collection(
     urdf.write_text(urdf.read_text().replace("</link>", shape, 1))
     selection = ObjectSelection(objects=tmp_path / "objects")
     with caplog.at_level(logging.WARNING):
-        objects_for(TASKS["push"], selection, tmp_path / "none", 1, 1)
+        objects_for(task_named("push"), selection, tmp_path / "none", 1, 1)
     assert "object box-0000: 1 of " in caplog.messages[0]
     assert "left out: 'textured_objs/new-1.obj' is absent" in caplog.messages[0]
     assert adaafford(["objects", "check", str(tmp_path / "objects")]) == 0
@@ -347,7 +347,7 @@ def test_a_task_takes_only_parts_of_its_kind(shelf: Path) -> None:
     assert "this is a Box" in reasons["box-0000"]
     drawers = [e.ref.id for e in catalogue.usable if {p.name for p in e.parts} == {"drawer"}]
     assert all(reasons[object_id] == "no part that the task 'pull-closed-door' may act on" for object_id in drawers)
-    assert len(for_task(catalogue, TASKS["push"]).usable) == 13
+    assert len(for_task(catalogue, task_named("push")).usable) == 13
 
 
 @given(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from collector import meshes, urdf
 from collector.files import ObjectFiles
-from collector.partnet import read_object
+from collector.readers import read_object
 from shared.errors import ObjectError
 
 CUBE_OBJ = (

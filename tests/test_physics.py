@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from collector.articulation import ArticulatedObject
-from collector.partnet import read_object
 from collector.primitives import Trial, hand_pose
 from collector.procedural import generate
+from collector.readers import read_object
 from collector.scene import Scene, restricted_limits
 from shared.configuration import FIDELITIES, PUBLISHED_LEG_S
 from shared.geometry import gripper_rotation

@@ -1,9 +1,7 @@
 """What examples/plugin adds: a twist that turns knobs and a wide hand, known to every command once it is installed."""
 
-import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,6 @@ import pytest
 
 from cluster.cli import run
 from collector.articulation import ArticulatedObject, Body, Joint
-from collector.grippers import GRIPPERS
 from collector.primitives import Trial
 from collector.scene import Scene
 from shared.configuration import FIDELITIES
@@ -19,37 +16,17 @@ from shared.geometry import gripper_rotation
 from shared.primitives import PRIMITIVES, PrimitiveSpec
 from shared.store import Store, verify
 from shared.vocabulary import Action, HiddenDynamics, Outcome
+from tests.example_package import PACKAGE, install, install_here
 from tests.single_door import base_with, box, drawer
 
 ROOT = Path(__file__).parents[1]
-PLUGIN = ROOT / "examples/plugin"
 EASY = HiddenDynamics(part_mass=0.1, joint_friction=0.05, surface_friction=2.0)
-
-
-def install(folder: Path) -> None:
-    """Put the package into a folder of Python's path as pip would, which needs no network and no build tools."""
-    project = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]
-    described = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    described.mkdir()
-    (described / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    )
-    lines = [
-        line
-        for group, entries in project["entry-points"].items()
-        for line in (f"[{group}]", *(f"{name} = {value}" for name, value in entries.items()))
-    ]
-    (described / "entry_points.txt").write_text("\n".join(lines) + "\n")
-    shutil.copytree(PLUGIN / "adaafford_example", folder / "adaafford_example")
 
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The package installed in this process, for one test."""
-    install(tmp_path)
-    for registry in (PRIMITIVES, GRIPPERS):
-        monkeypatch.setattr(registry, "_loaded", {})
-    monkeypatch.syspath_prepend(tmp_path)
+    install_here(tmp_path, monkeypatch)
 
 
 def knob(half_width: float) -> ArticulatedObject:
@@ -110,8 +87,7 @@ def test_an_installed_package_is_collected_with_and_named_in_the_setting(
     main = "from adaafford.console import main; main()"
     subprocess.run([venv / "bin/python", "-c", main, *command], check=True, cwd=tmp_path)
     collected = Store.open(store)
-    package = "adaafford-example 1.0"
-    assert collected.setting.extensions == (f"primitive twist: {package}", f"gripper wide: {package}")
+    assert collected.setting.extensions == (f"primitive twist: {PACKAGE}", f"gripper wide: {PACKAGE}")
     assert set(collected.interactions(["primitive"]).column("primitive").to_pylist()) == {"twist"}
     # Here the package is not installed: what it made can be read, and nothing can be added.
     assert verify(collected) == []

@@ -9,10 +9,10 @@ import pytest
 from collector import procedural
 from collector.articulation import ArticulatedObject, Mesh
 from collector.catalogue import qualifying_parts, scan
-from collector.partnet import read_object
 from collector.procedural.assembly import GRID, ProceduralObject, normalised
 from collector.procedural.cabinets import storage_furniture
 from collector.procedural.writing import object_files, write_object
+from collector.readers import read_object
 from shared.errors import UsageError
 from shared.tasks import TASKS
 
@@ -215,7 +215,7 @@ def test_a_place_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 def test_the_ambiguous_tasks_find_their_parts(made: Path) -> None:
     catalogue = scan(made)
     assert catalogue.refused == ()
-    counts = {name: sum(bool(qualifying_parts(e, task)) for e in catalogue.usable) for name, task in TASKS.items()}
+    counts = {task.name: sum(bool(qualifying_parts(e, task)) for e in catalogue.usable) for task in TASKS}
     assert counts["push"] == counts["pull"] == len(IDS)
     assert counts["push-faucet"] == EACH
     assert counts["pull-closed-door"] >= EACH // 2

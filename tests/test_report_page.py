@@ -10,7 +10,7 @@ import subprocess
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -33,7 +33,7 @@ from cluster.run_folder import ObjectsUsed, RunFolder, begin
 from shared.adaptation import Adapter
 from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import StoreError
-from shared.methods import MethodName
+from shared.methods import METHODS
 from shared.plan import EvaluationConfig, Job, ObjectRef, Plan, Setting
 from shared.policy import Policy
 from shared.records import RolloutRecord
@@ -325,8 +325,8 @@ def test_texts_are_one_line_of_bounded_length() -> None:
 
 
 def test_the_paper_has_figures_for_every_task_and_method() -> None:
-    for task in TASKS:
-        for method in get_args(MethodName):
+    for task in TASKS.names():
+        for method in METHODS.names():
             told = published(task, novel_categories=False)[method]
             assert all(0 < (told.at(budget, "f_score") or 0) < 100 for budget in (1, 2, 4))
             assert told.at(3, "f_score") is None or len(told.f_score) == 1

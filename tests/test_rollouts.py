@@ -228,7 +228,7 @@ def test_methods_use_their_own_proposers_budgets_and_policies(objects: Path) -> 
     )
     record = rollout(plan, objects)
     for name in methods:
-        method, rows = METHODS[name], [row for row in record.interactions if row.method == name]
+        method, rows = METHODS.get(name), [row for row in record.interactions if row.method == name]
         version = 1 if name == "ours-no-iteration" else 3
         assert {row.policy_version for row in rows} == {version}
         tries = [row for row in rows if row.role is Role.CONTEXT]
@@ -352,7 +352,7 @@ def test_a_setting_with_an_unknown_name_is_refused_with_those_there_are(changes:
 
 
 def test_a_setting_means_the_same_whether_it_was_resolved_or_not(objects: Path) -> None:
-    for name in TASKS:
+    for name in TASKS.names():
         written = plan_for(objects, name)
         resolved = plan_for(objects, name, collection=task_named(name).resolve(SMALL))
         assert written.setting.terms == resolved.setting.terms

@@ -10,12 +10,12 @@ import pytest
 from collector.articulation import ArticulatedObject
 from collector.clock import StageClock
 from collector.environment import SapienEnvironment
-from collector.partnet import read_object
 from collector.procedural import build
 from collector.procedural.assembly import ProceduralObject, normalised
 from collector.procedural.cabinets import storage_furniture
 from collector.procedural.writing import write_object
 from collector.proposers import RandomProposer
+from collector.readers import read_object
 from shared.configuration import CameraConfig, CollectionConfig
 from shared.geometry import camera_pose, gripper_rotation
 from shared.tasks import Task, task_named

@@ -19,7 +19,6 @@ from collector.rollout import make_environment
 from shared import seeds
 from shared.plan import Plan
 from shared.progress import Advance
-from shared.tasks import task_named
 from shared.vocabulary import Action, Float, HiddenDynamics, OutcomeKind
 
 ALL = "all"
@@ -141,7 +140,7 @@ def _rollout(plan: Plan, target: ArticulatedObject, index: int, draws: int, acti
     Where a draw lets the object come to rest elsewhere (a light lid stays up, a heavy one falls), the actions are
     drawn anew: its trials count for the base rate, and are pairs only with others that rest there as well.
     """
-    setting, task = plan.setting, task_named(plan.setting.task)
+    setting, task = plan.setting, plan.setting.task_record
     rng = seeds.generator(setting.seed, "bench/dynamics", index)
     states: list[_State] = []
     for _ in range(draws):

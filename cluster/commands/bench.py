@@ -14,7 +14,6 @@ from cluster.selection import ObjectSelection
 from cluster.settings import parse_flags
 from shared.configuration import FIDELITIES, CollectionConfig, Fidelity
 from shared.errors import UsageError
-from shared.tasks import task_named
 
 if TYPE_CHECKING:
     from shared.plan import Plan
@@ -26,7 +25,7 @@ class BenchSettings(ObjectSelection):
     """What every benchmark may be told."""
 
     task: str = "push"
-    """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
+    """Which manipulation task: push, pull, pull-closed-door, push-faucet, one that a package adds, or a TOML file."""
     primitive: str | None = None
     """Instead of the task's own primitive."""
     seed: int = Field(1, ge=0, lt=2**63)
@@ -236,7 +235,7 @@ def _print_collect(result: dict[str, Any]) -> None:
 @contextmanager
 def planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
     """A plan of random interactions, and the folder of its objects; built-in objects last as long as the context."""
-    task = task_named(command.task)
+    task = command.task_record
     from cluster.objects import objects_for
     from collector.setting import make_setting
     from shared.plan import Plan
@@ -247,7 +246,7 @@ def planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
         built_in = Path(scratch) / "objects"
         catalogue, folder = objects_for(task, command, built_in, command.procedural_per_category, command.seed)
         refs = tuple(entry.ref for entry in catalogue.usable)
-        yield Plan(setting=make_setting(task.name, collection, seed=command.seed, objects=refs)), folder
+        yield Plan(setting=make_setting(task, collection, seed=command.seed, objects=refs)), folder
 
 
 def finish(command: BenchSettings, name: str, result: dict[str, Any]) -> int:

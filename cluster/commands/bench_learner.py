@@ -13,7 +13,6 @@ from pydantic import Field
 from cluster.commands.bench import BenchSettings, finish, planned
 from cluster.settings import parse_flags
 from shared.progress import Progress
-from shared.tasks import task_named
 
 if TYPE_CHECKING:
     from shared.store import Store
@@ -125,7 +124,7 @@ def source_of(command: StoredSettings, store: "Store") -> dict[str, str]:
 @contextmanager
 def stored(command: StoredSettings) -> Iterator["Store"]:
     """The store to read: the one that was named, or one of random interactions that lasts as long as the context."""
-    task_named(command.task)
+    _ = command.task_record
     import torch
 
     from shared.store import Store

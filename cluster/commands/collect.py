@@ -14,8 +14,9 @@ from cluster.selection import ObjectSelection, RayAddress
 from cluster.settings import early_flags, layered, parse_flags
 from shared.configuration import CollectionConfig
 from shared.errors import StoreError, UsageError
+from shared.methods import RANDOM, needs_policy
 from shared.plan import ROLLOUTS_PER_SHARD
-from shared.tasks import task_named
+from shared.tasks import Task
 
 if TYPE_CHECKING:
     from shared.plan import ObjectRef
@@ -27,7 +28,7 @@ class CollectSettings(ObjectSelection):
     """What `adaafford collect` may be told by a file as well."""
 
     task: str = "push"
-    """Which manipulation task: push, pull, pull-closed-door or push-faucet."""
+    """Which manipulation task: push, pull, pull-closed-door, push-faucet, one that a package adds, or a TOML file."""
     rollouts: int = Field(100, ge=1)
     """How many the store shall hold of this plan, those of earlier attempts included; with --policy latest, of this
     proposer with any policy."""
@@ -59,11 +60,11 @@ class CollectCommand:
     settings: Annotated[CollectSettings, tyro.conf.arg(name="")]
     store: str
     """Folder or s3:// URL of the store: new, or of the same setting."""
-    proposer: Literal["random", "aip"] = "random"
-    """Who chooses the interactions."""
+    proposer: str = RANDOM
+    """Who chooses the interactions: random, aip, or another that the package or an installed one has."""
     policy: int | Literal["latest"] = 0
-    """Version of the policy in the store that the proposer uses; "aip" needs one. "latest": always the newest that is
-    published, also by a learner that is at work at the same time (`adaafford learn --follow`)."""
+    """Version of the policy in the store that the proposer uses; "random" needs none, "aip" does. "latest": always the
+    newest that is published, also by a learner that is at work at the same time (`adaafford learn --follow`)."""
     retry_quarantined: tyro.conf.FlagCreatePairsOff[bool] = False
     """Execute the rollouts again that the store holds as quarantined, once what made them fail was mended."""
     config: Path | None = None
@@ -76,12 +77,14 @@ def main(args: list[str]) -> int:
     config = Path(early["config"]) if early["config"] else None
     defaults = CollectCommand(layered(CollectSettings, None, config), tyro.MISSING, config=config)
     command = parse_flags(CollectCommand, args, "collect", defaults)
-    task_named(command.settings.task)
-    if (command.proposer == "aip") != (command.policy == "latest" or command.policy > 0):
-        raise UsageError("the proposer 'aip' needs --policy VERSION (1 or more, or latest), and 'random' takes none")
+    task = command.settings.task_record
+    learnt = needs_policy(command.proposer)
+    if learnt != (command.policy == "latest" or command.policy > 0):
+        wanted = "needs --policy VERSION (1 or more, or latest)" if learnt else "takes no --policy"
+        raise UsageError(f"the proposer '{command.proposer}' {wanted}")
     if command.settings.per_version is not None and command.policy != "latest":
         raise UsageError("--per-version is about the versions of --policy latest; without that, give --rollouts alone")
-    _collect(command)
+    _collect(command, task)
     return 0
 
 
@@ -104,7 +107,7 @@ def _begun_with(where: str, found: "tuple[ObjectRef, ...]") -> "tuple[ObjectRef,
     return known
 
 
-def _collect(command: CollectCommand) -> None:
+def _collect(command: CollectCommand, task: Task) -> None:
     from cluster.collection import Newest, collect
     from cluster.fleet import make_worker
     from cluster.objects import objects_for
@@ -117,16 +120,16 @@ def _collect(command: CollectCommand) -> None:
     from shared.store.provenance import changed_versions
 
     chosen, where = command.settings, absolute(command.store)
-    packages_used(task_named(chosen.task), chosen.collection)  # Refused before any object is read.
+    packages_used(task, chosen.collection)  # Refused before any object is read.
     catalogue, folder = objects_for(
-        task_named(chosen.task),
+        task,
         chosen,
         folder_beside(where, "objects"),
         chosen.procedural_per_category,
         chosen.seed,
     )
     setting = make_setting(
-        chosen.task,
+        task,
         chosen.collection,
         seed=chosen.seed,
         objects=_begun_with(where, tuple(entry.ref for entry in catalogue.usable)),

@@ -8,7 +8,7 @@ import tyro
 
 from cluster.evaluation_settings import EvaluateSettings
 from cluster.settings import parse_flags
-from shared.tasks import task_named
+from shared.methods import method_named
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,9 @@ def main(args: list[str]) -> int:
     """Evaluate."""
     command = parse_flags(EvaluateCommand, args, "evaluate", EvaluateCommand(EvaluateSettings(), tyro.MISSING))
     if command.settings.task is not None:
-        task_named(command.settings.task)
+        _ = command.settings.task_record
+    for method in command.settings.methods:
+        method_named(method)
     from cluster.evaluation_of_run import evaluate_run
 
     evaluate_run(command.run, command.settings, command.out)

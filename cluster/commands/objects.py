@@ -37,7 +37,7 @@ class CheckCommand:
     path: Annotated[Path, tyro.conf.Positional]
     """A folder of objects, or one object's folder."""
     task: str | None = None
-    """Say as well which objects suit this task."""
+    """Say as well which objects suit this task: a name, or a TOML file."""
     object_list: Path | None = None
     """Only the objects of this list, `<id> <category>` a line, such as Where2Act publishes."""
     categories: tuple[str, ...] = ()
@@ -96,12 +96,12 @@ def _generate(command: GenerateCommand) -> int:
 def _check(command: CheckCommand) -> int:
     from collector.catalogue import for_task, of_categories, scan
     from shared.categories import expanded
-    from shared.tasks import task_named
+    from shared.tasks import task_of
 
     lists = () if command.object_list is None else (command.object_list,)
     catalogue = of_categories(scan(command.path, *lists), expanded(command.categories))
     if command.task is not None:
-        catalogue = for_task(catalogue, task_named(command.task))
+        catalogue = for_task(catalogue, task_of(command.task))
     described = {object_id: f"refused: {reason}" for object_id, reason in catalogue.refused}
     described |= dict.fromkeys((entry.ref.id for entry in catalogue.usable), "")
     entries, restless = {entry.ref.id: entry for entry in catalogue.usable}, 0
@@ -127,8 +127,9 @@ def _draws_at_rest(entry: "CatalogueEntry", task: str | None) -> tuple[int, int]
     from collector.setting import make_setting
     from shared.configuration import CollectionConfig
     from shared.plan import Plan
+    from shared.tasks import task_of
 
-    setting = make_setting(task or "push", CollectionConfig(), seed=1, objects=(entry.ref,))
+    setting = make_setting(task_of(task or "push"), CollectionConfig(), seed=1, objects=(entry.ref,))
     return draws_at_rest(Plan(setting=setting), 0, load(entry)), TRIES
 
 

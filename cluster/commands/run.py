@@ -9,7 +9,7 @@ import tyro
 from cluster.configuration import CampaignConfig
 from cluster.settings import early_flags, layered, parse_flags
 from shared.errors import UsageError
-from shared.tasks import task_named
+from shared.methods import method_named
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,13 @@ def main(args: list[str]) -> int:
     preset, config = early["preset"] or "smoke", Path(early["config"]) if early["config"] else None
     defaults = RunCommand(layered(CampaignConfig, preset, config), None, preset, config)
     command = parse_flags(RunCommand, args, "run", defaults)
-    task_named(command.settings.task)
+    _ = command.settings.task_record
+    for method in command.settings.evaluation.methods:
+        method_named(method)
+    if command.settings.learner.baselines:
+        from learner.recipes import check_baselines
+
+        check_baselines(command.settings.learner)
     if command.dry_run:
         from cluster.estimate import RATES, estimate
         from cluster.estimate_table import print_estimate

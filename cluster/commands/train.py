@@ -9,18 +9,19 @@ import tyro
 from cluster.settings import early_flags, layered, parse_flags
 from learner.configuration import LearnerConfig
 from shared.errors import UsageError
+from shared.methods import BASELINES
 
 if TYPE_CHECKING:
     from learner.stages import Memory
 
-STAGES = ("prior", "aap", "aip", "where2act-interaction", "where2act-adaptation", "alternate")
+STAGES = ("prior", "aap", "aip", *BASELINES.names(), "alternate")
 USAGE = f"""usage: adaafford train {{{",".join(STAGES)}}} --store STORE --out RUN [--init RUN] [SETTINGS]
 
   prior      the Where2Act prior, from nothing
   aap        Adaptive Affordance Prediction; --init names the --out of a prior
   aip        Adaptive Interaction Proposal; --init names the --out of an aap
-  where2act-interaction, where2act-adaptation
-             baselines of the paper, from a prior; the policy keeps what else it holds
+  {", ".join(BASELINES.names())}
+             baselines; the policy keeps what else it holds
   alternate  prior, aap and aip, and the last two again until validation improves no more
 
 The same command again goes on where it was stopped. `torchrun --nproc-per-node N -m cluster train ...` shares each
@@ -67,16 +68,18 @@ def _train(stage: str, command: TrainCommand, memory: "Memory | None") -> None:
     from learner.alternation import alternate
     from learner.data import read_object_list
     from learner.hardware import hardware
+    from learner.recipes import check_baselines
     from learner.stages import StageJob, run_stage
 
     job = StageJob(
-        stage="prior" if stage == "alternate" else stage,  # type: ignore[arg-type]
+        stage="prior" if stage == "alternate" else stage,
         store=command.store,
         out=command.out,
         init=command.init,
         train_objects=read_object_list(command.train_objects),
         validation_objects=read_object_list(command.validation_objects),
     )
+    check_baselines(command.settings)
     with hardware(command.settings) as used:
         if stage == "alternate":
             alternate(job, command.settings, used)

@@ -16,11 +16,11 @@ from collector.articulation import ArticulatedObject
 from collector.catalogue import load_ref
 from collector.clock import StageClock
 from collector.environment import SapienEnvironment
-from collector.partnet import read_object
 from collector.procedural.assembly import normalised
 from collector.procedural.cabinets import storage_furniture
 from collector.procedural.writing import write_object
 from collector.proposers import RepeatingProposer
+from collector.readers import read_object
 from collector.recorder import interact
 from shared import seeds
 from shared.adaptation import Adapter
@@ -29,7 +29,6 @@ from shared.errors import ObjectError
 from shared.geometry import camera_pose
 from shared.plan import ObjectRef, Setting
 from shared.proposers import proposer_named
-from shared.tasks import task_named
 from shared.vocabulary import Action, Direction, Float32, HiddenDynamics, Interaction, Observation, Proposer
 
 TRIES = 4
@@ -83,7 +82,7 @@ class Laboratory:
     def __init__(self, setting: Setting, adapter: Adapter) -> None:
         self.setting = setting
         self.adapter = adapter
-        self.task = task_named(setting.task)
+        self.task = setting.task_record
 
     def posteriors(self, variation: Variation) -> list[Posterior]:
         """The affordance under each value after the same tries; values under which nothing can be tried are skipped."""
@@ -132,7 +131,7 @@ def variations(setting: Setting, target: ArticulatedObject, twins: Sequence[Arti
         target: a test object.
         twins: the same cabinet hung on its left and on its right; none where the task is not about doors.
     """
-    ranges, task = setting.dynamics, task_named(setting.task)
+    ranges, task = setting.dynamics, setting.task_record
     middle = HiddenDynamics({name: _middle(interval) for name, interval in ranges.root.items()}, task.directions[0])
 
     def growing(name: str, interval: Range) -> Variation:
@@ -161,7 +160,7 @@ def hinge_twins(setting: Setting, folder: Path) -> list[ArticulatedObject]:
         setting: of the run's evaluation; tasks that are not about cabinets get none.
         folder: where they are written.
     """
-    categories = task_named(setting.task).categories
+    categories = setting.task_record.categories
     if categories and HINGED not in categories:
         return []
     left = write_object(folder / "left", normalised(storage_furniture("left", *CABINET_M)))

@@ -1,15 +1,25 @@
 """Where2Act-adaptation: Where2Act whose scores are corrected at points similar to those that were tried.
 
-Shapes: Q points asked about, K tries.
+How it is trained stands in `learner.where2act_adaptation`. Shapes: N points of a cloud, A actions, S proposals at a
+point, Q points asked about, K tries.
 """
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from shared.adaptation import Adapter, Proposals, point_indices
+from shared.methods import Baseline, Method
 from shared.networks.actions import PLACE_SCALE
 from shared.networks.configuration import NetworkConfig
 from shared.networks.layers import Head, VectorEncoder, point_features
+from shared.vocabulary import Action, Float32, Interaction, Observation
 
+NAME = "where2act-adaptation"
+METHOD = Method("where2act-fps", NAME)
 FIRST_LOGIT = -2.0
 """Of a similarity under untrained weights: about 0.1, so that training begins near the prior."""
 
@@ -54,3 +64,57 @@ def influences(similarities: Tensor, successes: Tensor, scores: Tensor) -> Tenso
         scores: s_u, what Where2Act said of the tries, [..., K].
     """
     return (successes - scores)[..., None, :] * similarities
+
+
+class AdaptationCritic:
+    """Where2Act-adaptation: Where2Act, corrected at points similar to those tried (AdaAfford, Details of Baselines).
+
+    s_u*|new = s_u* + sum (r - s_u) sim_pq, and a_q likewise. Deviation: cut to [0, 1], which the paper does not say.
+    """
+
+    name = NAME
+
+    def __init__(self, adapter: Adapter) -> None:
+        self.adapter = adapter
+        self._network = adapter.policy.baseline(NAME, Where2ActAdaptation)
+
+    def affordance(
+        self, observation: Observation, points: NDArray[np.int64], history: Sequence[Interaction]
+    ) -> Float32:
+        """Where2Act's actionability, corrected, [Q]."""
+        before = torch.from_numpy(self.adapter.prior_affordance(observation, points))
+        return self._corrected(before, observation, points, history).numpy()
+
+    def predict(self, observation: Observation, actions: Sequence[Action], history: Sequence[Interaction]) -> Float32:
+        """Where2Act's scores, corrected, [A]."""
+        before = torch.from_numpy(self.adapter.prior_score(observation, actions))
+        return self._corrected(before, observation, point_indices(actions), history).numpy()
+
+    def predict_proposals(
+        self, observation: Observation, proposals: Proposals, history: Sequence[Interaction]
+    ) -> Tensor:
+        """Where2Act's scores, corrected, [S]; all by the same, since similarity is one of points."""
+        before = self.adapter.prior_score_proposals(observation, proposals)
+        return self._corrected(before, observation, np.array([proposals.point]), history)
+
+    @torch.inference_mode()
+    def _corrected(
+        self, before: Tensor, observation: Observation, points: NDArray[np.int64], history: Sequence[Interaction]
+    ) -> Tensor:
+        """Scores, [...], broadcast against [Q], after the tries of the history."""
+        after = before
+        features, places = self.adapter.features(observation, "prior", points), self.adapter.places(observation, points)
+        for interaction in history:
+            tried, at = interaction.observation, point_indices([interaction.action])
+            similarities = self._network.similarities(
+                self.adapter.features(tried, "prior", at),
+                features,
+                (places - self.adapter.places(tried, at)).norm(dim=-1),
+            )
+            success = torch.tensor([float(interaction.outcome.success)])
+            score = torch.from_numpy(self.adapter.prior_score(tried, [interaction.action]))
+            after = after + influences(similarities[:, None], success, score)[:, 0]
+        return after.clamp(0.0, 1.0)
+
+
+BASELINE = Baseline(Where2ActAdaptation, AdaptationCritic, training="learner.where2act_adaptation:TRAINING")

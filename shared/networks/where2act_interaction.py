@@ -1,10 +1,19 @@
-"""Where2Act-interaction: Where2Act that is shown four tries at once."""
+"""Where2Act-interaction: Where2Act that is shown four tries at once.
 
+How it is trained stands in `learner.where2act_interaction`.
+"""
+
+from functools import partial
+
+from shared.critics import AdaptiveCritic
+from shared.methods import Baseline, Method
 from shared.networks.aap import Aap
 from shared.networks.prior import Prior
 
+NAME = "where2act-interaction"
 TRIES = 4
 """Interactions that it is shown (AdaAfford, Baselines and Ablation Study)."""
+METHOD = Method("where2act-fps", NAME, in_one_shot=TRIES)
 
 
 class Where2ActInteraction(Aap):
@@ -29,3 +38,11 @@ class Where2ActInteraction(Aap):
         if network.place_encoder is not None and prior.place_encoder is not None:
             network.place_encoder.load_state_dict(prior.place_encoder.state_dict())
         return network
+
+
+BASELINE = Baseline(
+    Where2ActInteraction,
+    partial(AdaptiveCritic, name=NAME),
+    training="learner.where2act_interaction:TRAINING",
+    begin=Where2ActInteraction.starting_from,
+)
