@@ -6,9 +6,8 @@ from pydantic import Field, field_validator, model_validator
 
 from cluster.selection import ObjectSelection, RayAddress
 from collector.guard import Limits
-from learner.configuration import AapConfig, AdaptationConfig, AipConfig, InteractionConfig, PriorConfig
+from learner.configuration import LearnerSettings
 from shared.configuration import CollectionConfig, StrictModel
-from shared.networks.configuration import NetworkConfig
 from shared.plan import ROLLOUTS_PER_SHARD, EvaluationConfig
 
 EXECUTION_SETTINGS = frozenset({"workers", "ray_address", "rollout_limit_s", "memory_limit_mb"})
@@ -33,6 +32,10 @@ class RolloutCounts(StrictModel):
     def total(self, count: int, objects: int) -> int:
         """How many rollouts `count` means where there are so many objects."""
         return count * objects if self.per_object else count
+
+    def of_round(self, version: int, objects: int) -> int:
+        """How many rollouts the round of a policy makes on so many objects; version 0 is the random round."""
+        return self.total(self.aip if version else self.random, objects)
 
 
 class SplitConfig(StrictModel):
@@ -77,17 +80,6 @@ class ProceduralConfig(StrictModel):
 
     per_category: int = Field(8, ge=1, le=10_000)
     """Objects of each category that the task applies to."""
-
-
-class LearnerSettings(StrictModel):
-    """What the learner is told, apart from the seed, which is the campaign's."""
-
-    network: NetworkConfig = NetworkConfig()
-    prior: PriorConfig = PriorConfig()
-    aap: AapConfig = AapConfig()
-    aip: AipConfig = AipConfig()
-    interaction: InteractionConfig = InteractionConfig()
-    adaptation: AdaptationConfig = AdaptationConfig()
 
 
 class CampaignConfig(ObjectSelection):

@@ -166,7 +166,18 @@ class AlternationConfig(StrictModel):
     """Rounds in a row that do not count, after which it has converged."""
 
 
-class LearnerConfig(StrictModel):
+class LearnerSettings(StrictModel):
+    """What decides the networks, apart from the seed; a campaign's `learner` settings."""
+
+    network: NetworkConfig = NetworkConfig()
+    prior: PriorConfig = PriorConfig()
+    aap: AapConfig = AapConfig()
+    aip: AipConfig = AipConfig()
+    interaction: InteractionConfig = InteractionConfig()
+    adaptation: AdaptationConfig = AdaptationConfig()
+
+
+class LearnerConfig(LearnerSettings):
     """Everything that `adaafford train` may be told by a file."""
 
     seed: int = Field(0, ge=0)
@@ -177,9 +188,3 @@ class LearnerConfig(StrictModel):
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of a training step's products; "bf16" is for GPUs, and CPUs with instructions for it. Weights stay in fp32."""
     alternation: AlternationConfig = AlternationConfig()
-    network: NetworkConfig = NetworkConfig()
-    prior: PriorConfig = PriorConfig()
-    aap: AapConfig = AapConfig()
-    aip: AipConfig = AipConfig()
-    interaction: InteractionConfig = InteractionConfig()
-    adaptation: AdaptationConfig = AdaptationConfig()

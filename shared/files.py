@@ -223,6 +223,10 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+DRIVER_LOCK = ".lock-driver"
+"""What a driver holds of its run or learner's folder: two of them would do everything twice."""
+
+
 @contextmanager
 def exclusive_lock(path: Path, wait_seconds: float = 0.0) -> Iterator[None]:
     """Hold a file's lock; the kernel gives it back when the holder dies, however it dies.

@@ -38,8 +38,7 @@ def main(args: list[str]) -> int:
     command = parse_flags(RunCommand, args, "run", defaults)
     task_named(command.settings.task)
     if command.dry_run:
-        from cluster.estimate import RATES, estimate
-        from cluster.estimate_table import print_estimate
+        from cluster.estimate import RATES, estimate, print_estimate
 
         print_estimate(estimate(command.settings), command.settings.workers, RATES)
         return 0
