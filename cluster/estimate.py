@@ -22,7 +22,7 @@ from learner.alternation import AlternationStep, Collect, Train
 from learner.configuration import AffordanceConfig
 from shared.errors import UsageError
 from shared.fps import FPS_PROPOSERS
-from shared.methods import METHODS
+from shared.methods import METHODS, BaselineName
 from shared.networks.configuration import NetworkConfig
 from shared.networks.where2act_interaction import TRIES
 from shared.plan import ObjectRef
@@ -196,10 +196,8 @@ class _Costs:
                 seconds, encoders = self._aap_s(first=step.round == 1), 1 if step.round == 1 else 2
             case "aip":
                 seconds, encoders = self._aip_s(), int(self.config.learner.aip.training == "paper")
-            case "where2act-interaction":
-                seconds, encoders = self._interaction_s(), 1
-            case "where2act-adaptation":
-                seconds, encoders = self._adaptation_s(), 0
+            case _:
+                seconds, encoders = self._baseline_s(step.network)
         encoding_s = self.clouds * encoders * FORWARD_SHARE * self.encode_s
         return StageCost(step.name, 0, seconds + encoding_s, LEFT_BY_TRAINING * self.weights_bytes)
 
@@ -227,15 +225,15 @@ class _Costs:
         rows = told.batch_rollouts * told.rows_per_rollout * told.draws * (told.context + 1)
         return self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance)
 
-    def _interaction_s(self) -> float:
-        told = self.config.learner.interaction
-        rows = told.batch_rollouts * told.rows_per_rollout * (TRIES + 1)
-        clouds = told.batch_rollouts * self._clouds_a_rollout(0)
-        return self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance)
-
-    def _adaptation_s(self) -> float:
-        told = self.config.learner.adaptation
-        return self._steps_s(told.steps, 0, told.batch_rollouts * told.rows_per_rollout * told.context)
+    def _baseline_s(self, name: BaselineName) -> tuple[float, int]:
+        learner = self.config.learner
+        if name == "where2act-interaction":
+            told = learner.interaction
+            clouds = told.batch_rollouts * self._clouds_a_rollout(0)
+            rows = told.batch_rollouts * told.rows_per_rollout * (TRIES + 1)
+            return self._steps_s(told.steps, clouds, rows) + self._affordance_s(told.affordance), 1
+        rows = learner.adaptation.batch_rollouts * learner.adaptation.rows_per_rollout
+        return self._steps_s(learner.adaptation.steps, 0, rows * learner.adaptation.context), 0
 
     def _affordance_s(self, told: AffordanceConfig) -> float:
         answered = told.questions * told.proposals * self.rates.scored_row_s
