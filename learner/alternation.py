@@ -25,7 +25,6 @@ from pydantic import BaseModel, Field
 from learner import sharing
 from learner.configuration import AlternationConfig, LearnerConfig
 from learner.hardware import Hardware
-from learner.recipes import ORACLE_FILE
 from learner.stages import DONE_FILE, MAX_DONE_BYTES, Memory, StageJob, StageName, read_done, run_stage
 from shared.documents import read_document
 from shared.errors import StoreError, UsageError
@@ -244,38 +243,20 @@ class AlternationRecord(BaseModel):
     best: int = Field(ge=1, le=1000)
 
 
-@dataclass(frozen=True, slots=True)
-class Trained:
-    """Where a training left what it made.
-
-    Attributes:
-        policy: the folder of the stage whose policy is its best.
-        oracle: the file of its oracle critic, where privileged training left one.
-    """
-
-    policy: Path
-    oracle: Path | None
-
-
-def trained_in(out: Path) -> Trained:
-    """What the --out of an alternation, or of a single stage, holds.
+def trained_in(out: Path) -> Path:
+    """The folder of the best policy in the --out of an alternation, or of a single stage.
 
     Raises:
         UsageError: no finished training.
         StoreError: its record is damaged.
     """
-    record = out / ALTERNATION_FILE
+    record, policy = out / ALTERNATION_FILE, out
     if record.is_file():
-        told = read_document(
-            AlternationRecord, record, MAX_DONE_BYTES, "damaged; the same training again writes it anew"
-        )
-        policy = out / f"aip-{told.best}"
-    else:
-        policy = out
+        advice = "damaged; the same training again writes it anew"
+        policy = out / f"aip-{read_document(AlternationRecord, record, MAX_DONE_BYTES, advice).best}"
     if not (policy / DONE_FILE).is_file():
         raise UsageError(f"{out}: holds no finished training; name the --out of `adaafford train alternate` or aap")
-    oracle = policy / ORACLE_FILE
-    return Trained(policy, oracle if oracle.is_file() else None)
+    return policy
 
 
 def best_score(folder: Path) -> float:

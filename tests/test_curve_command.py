@@ -70,11 +70,10 @@ def test_trainings_are_judged_between_where2act_and_the_oracle(
 
 def test_what_was_seen_is_written_down_from_stage_to_stage(folder: Path) -> None:
     found = trained_in(folder / "seed-1")
-    assert found.policy == folder / "seed-1" / "aip-1"
-    assert found.oracle == found.policy / ORACLE_FILE
-    assert found.oracle.read_bytes() == (folder / "seed-1" / "aap-1" / ORACLE_FILE).read_bytes()
+    assert found == folder / "seed-1" / "aip-1"
+    assert (found / ORACLE_FILE).read_bytes() == (folder / "seed-1" / "aap-1" / ORACLE_FILE).read_bytes()
     hashes = {ref.content_hash for ref in fabricate_setting(objects=3).objects}
-    assert objects_seen(found.policy) == objects_seen(folder / "paper") == hashes
+    assert objects_seen(found) == objects_seen(folder / "paper") == hashes
 
 
 @pytest.mark.parametrize(
