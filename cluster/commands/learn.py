@@ -33,6 +33,11 @@ def main(args: list[str]) -> int:
     for name in ("first_rollouts", "more_rollouts", "poll_s"):
         if getattr(command, name) <= 0:
             raise UsageError(f"--{name.replace('_', '-')} must be above 0; given {getattr(command, name)}")
+    _learn(command)
+    return 0
+
+
+def _learn(command: LearnCommand) -> None:
     from learner import sharing
     from learner.alternation import Finished, alternate
     from learner.following import Following, Pace, publish
@@ -57,4 +62,3 @@ def main(args: list[str]) -> int:
         else:
             best = alternate(Finished(job), command.settings, used)
             publish(Store.open(command.store), command.out, "best", best)
-    return 0
