@@ -1,4 +1,4 @@
-"""The campaign: the alternation of collection and training as a list of stages over one folder.
+"""The campaign: the alternation over one folder, from the choice of objects to the report.
 
     objects, collect-random, train-prior,
     train-aap-1, train-aip-1, publish-1,        (a run that starts from a policy has `adopt` for the three trainings)
@@ -14,111 +14,124 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from cluster.adoption import fit_to_start_from, seen_by, unknown
+from cluster.adoption import adopt, fit_to_start_from, seen_by, unknown
+from cluster.children import THREADS, Child
 from cluster.collection import collect
 from cluster.configuration import CampaignConfig
 from cluster.evaluation import Evaluation, figures_of
-from cluster.fleet import Fleet, make_worker
 from cluster.ledger import Ledger
-from cluster.locking import only_driver
 from cluster.objects import lists_of, objects_for, split_as_told
 from cluster.run_folder import ObjectsUsed, RunFolder
-from cluster.session import FleetMaker, fleets
-from cluster.stages import Stage, run_stages
-from cluster.training import Trainer
+from cluster.session import Crew, fleets
 from collector.setting import make_setting, packages_used
+from learner.alternation import AlternationStep, Collect, Publish, alternation, perform
+from learner.configuration import LearnerConfig
+from learner.stages import StageJob, as_json
 from shared.errors import UsageError
-from shared.files import write_atomically
+from shared.files import DRIVER_LOCK, exclusive_lock, read_bounded, write_atomically
 from shared.methods import baselines_of
 from shared.plain import plain
 from shared.plan import Plan, Setting
+from shared.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
 from shared.store import Store
 from shared.store.provenance import changed_versions, software_versions
 
 
-class Crew:
-    """The live fleet: one at a time, since each worker holds a CPU; kept as long as the store stays the same."""
-
-    def __init__(self, make_fleet: FleetMaker) -> None:
-        self._make_fleet = make_fleet
-        self._fleet: Fleet | None = None
-        self._of: tuple[Path, Path] | None = None
-
-    def for_store(self, store: Store, objects: Path) -> Fleet:
-        """The fleet whose workers write to `store`."""
-        if self._fleet is None or self._of != (store.path, objects):
-            self.dismiss()
-            self._fleet = self._make_fleet(partial(make_worker, store.path, objects), store.underway)
-            self._of = store.path, objects
-        return self._fleet
-
-    def dismiss(self) -> None:
-        """End the workers."""
-        if self._fleet is not None:
-            self._fleet.close()
-        self._fleet = None
+def steps_of(config: CampaignConfig) -> list[AlternationStep]:
+    """All steps of a campaign, in order; each is done once, and may be done again if a kill comes before its note."""
+    rounds = alternation(
+        lambda number: number <= config.alternations,
+        adopts=config.start_from is not None,
+        baselines=baselines_of(config.evaluation.methods),
+    )
+    return [AlternationStep("objects"), *rounds, AlternationStep("evaluate"), AlternationStep("report")]
 
 
 class Campaign:
-    """One run, from nothing or from wherever it was stopped to its report."""
+    """One run, from nothing or from wherever it was stopped to its report.
+
+    It is the `Rollouts` of its alternation: it collects them itself.
+
+    Args:
+        run: its folder.
+        config: its settings.
+    """
+
+    _crew: Crew
 
     def __init__(self, run: RunFolder, config: CampaignConfig) -> None:
         self._run = run
         self._config = config
         self._console = Console(file=sys.stderr, highlight=False)
-        self._trainer = Trainer(run, config, self._say)
+        self._learner = Child(lambda line: self._say(f"  {line}"), run.path)
 
     def execute(self) -> None:
         """Do what is left to do.
 
         Raises:
-            AdaAffordError: a stage cannot go on; what was done stays done.
+            AdaAffordError: a step cannot go on; what was done stays done.
         """
-        config = self._config
-        with only_driver(self._run.path), closing(self._trainer):
-            ledger = Ledger(self._run.log)
+        run, config, steps = self._run, self._config, steps_of(self._config)
+        with exclusive_lock(run.path / DRIVER_LOCK), closing(self._learner):
+            ledger = Ledger(run.log)
             ledger.note("attempt", workers=config.workers, software=software_versions())
+            changed = changed_versions(run.begun_with())
+            if changed and any(step.name not in ledger.finished for step in steps):
+                self._say(f"begun with other software: {changed}; what is made from here on may differ by it")
             with fleets(config.workers, config.limits, config.ray_address) as make_fleet:
-                stages = self.stages(Crew(make_fleet))
-                changed = changed_versions(self._run.begun_with())
-                if changed and any(stage.name not in ledger.finished for stage in stages):
-                    self._say(f"begun with other software: {changed}; what is made from here on may differ by it")
-                run_stages(stages, ledger, self._say)
+                self._crew = Crew(make_fleet)
+                ledger.run({step.name: partial(self._do, step) for step in steps}, self._say)
             from cluster.report import print_report
 
-            print_report(self._run)
+            print_report(run)
 
-    def stages(self, crew: Crew) -> list[Stage]:
-        """All stages, in order."""
-        trainer = self._trainer
-        stages = [
-            Stage("objects", self._choose_objects),
-            Stage("collect-random", partial(self._collect, crew, "random", 0, self._config.rollouts.random)),
-            Stage("adopt", trainer.adopt) if trainer.adopts else Stage("train-prior", trainer.prior),
-        ]
-        final = self._config.alternations + 1
-        for version in range(1, final + 1):
-            if version > 1:
-                count = self._config.rollouts.aip
-                stages.append(
-                    Stage(f"collect-aip-{version - 1}", partial(self._collect, crew, "aip", version - 1, count))
-                )
-            last = trainer.left_by(version)
-            if version > 1 or not trainer.adopts:
-                stages += [
-                    Stage(f"train-aap-{version}", partial(trainer.aap, version)),
-                    Stage(f"train-aip-{version}", partial(trainer.aip, version)),
-                ]
-            for name in baselines_of(self._config.evaluation.methods) if version == final else ():
-                stages.append(Stage(f"train-{name}", partial(trainer.baseline, name, last)))
-                last = name
-            stages.append(Stage(f"publish-{version}", partial(trainer.publish, version, last)))
-        return [*stages, Stage("evaluate", partial(self._evaluate, crew, final)), Stage("report", self._report)]
+    def _do(self, step: AlternationStep) -> Mapping[str, Any]:
+        match step.name:
+            case "objects":
+                return self._choose_objects()
+            case "adopt":
+                assert self._config.start_from is not None, "the run starts from a policy"
+                adopt(self._config.start_from, self._config.task, self._run.adopted)
+                return {"policy_folder": str(self._run.adopted.relative_to(self._run.path))}
+            case "evaluate":
+                return self._evaluate()
+            case "report":
+                return self._report()
+        return perform(step, self, self._train)
+
+    def collect(self, step: Collect) -> Mapping[str, Any]:
+        """Collect what is missing of a round."""
+        store, folder, rollouts = Store.open(self._run.store), self._run.objects_folder(), self._config.rollouts
+        plan = Plan(setting=store.setting, proposer=step.proposer, policy_version=step.version)
+        wanted = rollouts.of_round(step.version, len(store.setting.objects))
+        with store.only_driver():
+            open_fleet = partial(self._crew.for_store, store, folder)
+            collected = collect(store, plan, wanted, rollouts.per_shard, open_fleet, folder)
+        return figures_of(collected)
+
+    def job(self, number: int) -> StageJob:
+        """Every round learns from all that the store holds."""
+        used = self._run.objects_used()
+        train, validation = (frozenset(ref.id for ref in refs) for refs in (used.train, used.validation))
+        return StageJob("prior", self._run.store, self._run.trainings, None, train, validation or None)
+
+    def publish(self, step: Publish) -> Mapping[str, Any]:
+        """Put a policy into the store, where collectors find it."""
+        # They want the learner's cores and its memory.
+        self._learner.close()
+        folder = self._run.training(step.folder)
+        files = {name: read_bounded(folder / name, MAX_WEIGHTS_BYTES) for name in (WEIGHTS_FILE, POLICY_FILE)}
+        Store.open(self._run.store).publish_policy(step.version, files)
+        self._say(f"published policy {step.version}, {sum(map(len, files.values())) / 1e6:.1f} MB")
+        return {"policy": step.version}
+
+    def _train(self, job: StageJob) -> None:
+        told = LearnerConfig(seed=self._config.seed, threads=THREADS, **dict(self._config.learner))
+        self._learner.run("learner.stages:run_from_json", as_json(job, told), job.out)
 
     def _choose_objects(self) -> Mapping[str, Any]:
         """Decide which objects are trained on and which are kept for the end, and make both stores."""
@@ -166,19 +179,9 @@ class Campaign:
             evaluation=config.evaluation if evaluation else None,
         )
 
-    def _collect(self, crew: Crew, proposer: str, version: int, rollouts: int) -> Mapping[str, Any]:
-        """One collection round."""
-        store, folder = Store.open(self._run.store), self._run.objects_folder()
-        plan = Plan(setting=store.setting, proposer=proposer, policy_version=version)
-        open_fleet = partial(crew.for_store, store, folder)
-        with store.only_driver():
-            wanted = self._config.rollouts.total(rollouts, len(store.setting.objects))
-            collected = collect(store, plan, wanted, self._config.rollouts.per_shard, open_fleet, folder)
-        return figures_of(collected)
-
-    def _evaluate(self, crew: Crew, version: int) -> Mapping[str, Any]:
+    def _evaluate(self) -> Mapping[str, Any]:
         """Try every method on unseen objects with the last policy, and write the table."""
-        run, rollouts = self._run, self._config.rollouts
+        run, rollouts, version = self._run, self._config.rollouts, self._config.alternations + 1
         evaluation = Evaluation(
             store=Store.open(run.evaluation),
             policies=Store.open(run.store),
@@ -189,8 +192,7 @@ class Campaign:
             oracle=run.oracle,
             out=run.training("evaluate"),
         )
-        open_fleet = partial(crew.for_store, evaluation.store, evaluation.objects)
-        collected = evaluation.execute(open_fleet, crew.dismiss, self._say)
+        collected = evaluation.execute(self._crew, self._say)
         return {**figures_of(collected), "policy": version}
 
     def _report(self) -> Mapping[str, Any]:

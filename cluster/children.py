@@ -1,14 +1,24 @@
-"""Child processes that share this one with neither Ray nor SAPIEN: learners, and what judges a policy.
+"""Child processes that share this one with neither Ray nor SAPIEN: what trains networks, and what judges a policy.
 
-They die with this process, however that dies (`cluster.lifeline`).
+    Child(say).run("learner.stages:run_from_json", {"job": ..., "config": ...}, out)
+
+calls that function with these arguments, which are JSON, in a process that lives until `close` or until a call fails.
+It dies with this process, however that dies. Each call is one line of the child's standard input, a JSON list of the
+function and its arguments; the answer is a line of `ENDED` and an exit code, after all that the function printed.
 """
 
+import ctypes
 import json
 import os
+import signal
 import subprocess
-from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from shared.errors import UsageError, WorkerError
 from shared.interpreter import PYTHON, own_environment
@@ -20,64 +30,58 @@ PATIENCE_S = 10.0
 """How long a child may take to end when asked to."""
 OUTPUT_FILE = "output.txt"
 ENDED = "\x1e"
-"""What the line begins with, before an exit code, in which a child says that one piece of work has ended: the ASCII
-record separator, which no other line begins with."""
+"""The ASCII record separator, which no other line begins with."""
+_PR_SET_PDEATHSIG = 1
 
 
 class Child:
-    """`python -m MODULE ARGUMENTS`.
+    """A process that runs one function after another; it begins with the first, and anew after one that failed.
 
     Args:
-        module: what to run.
-        arguments: its arguments.
-        told: whether it is given its work on standard input.
+        say: is given each line that it prints, as it comes.
+        root: the run's folder, which may be published or moved; the folder of each call where none is given.
     """
 
-    def __init__(self, module: str, arguments: Sequence[str] = (), *, told: bool = False) -> None:
-        wrapper = [*PYTHON, "-m", "cluster.lifeline", str(os.getpid())]
-        # A session of its own: Ctrl-C reaches this process alone, which then ends the child in an orderly way.
-        self._process = subprocess.Popen(
-            [*wrapper, *PYTHON, "-m", module, *arguments],
-            env=_environment(),
-            stdin=subprocess.PIPE if told else subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            text=True,
-            errors="replace",
-        )
+    def __init__(self, say: Callable[[str], None], root: Path | None = None) -> None:
+        self._say = say
+        self._root = root
+        self._process: subprocess.Popen[str] | None = None
 
-    def tell(self, line: str) -> None:
-        """Give it a line of input; if it is dead, `wait` says so."""
-        assert self._process.stdin is not None, "it is one that is told"
-        with suppress(BrokenPipeError):
-            self._process.stdin.write(f"{line}\n")
-            self._process.stdin.flush()
-
-    def wait(self, out: Path, what: str, say: Callable[[str], None], root: Path | None = None) -> None:
-        """Wait until it ends, or until it has done what it was told.
+    def run(self, function: str, arguments: Mapping[str, Any], out: Path) -> None:
+        """Call a function there, and wait until it has returned.
 
         Args:
-            out: folder that gets output.txt, everything that it printed, with paths relative to `root`.
-            what: its command, for messages.
-            say: is given each line as it comes.
-            root: the run's folder, which may be published or moved; `out` where none is given.
+            function: "module:name" of one that returns nothing.
+            arguments: its arguments by name, as JSON has them.
+            out: folder that gets output.txt, everything that it printed, with paths relative to the root.
 
         Raises:
             UsageError: it refused its input; its own line is the message.
             WorkerError: it failed otherwise; the message names output.txt.
         """
         out.mkdir(parents=True, exist_ok=True)
-        with (out / OUTPUT_FILE).open("w", encoding="utf-8") as log:
-            last, code = self._relay(lambda line: log.write(without_places(line, root or out)), say)
-        if code == UsageError.exit_code:
-            raise UsageError(last.removeprefix("adaafford: "))
-        if code != 0:
-            raise WorkerError(f"`{what}` ended with code {code}; see {out / OUTPUT_FILE}")
+        if self._process is None:
+            self._process = _start()
+        try:
+            with (out / OUTPUT_FILE).open("w", encoding="utf-8") as log:
+                # Where it is dead, the relay says so.
+                with suppress(BrokenPipeError):
+                    print(json.dumps([function, arguments]), file=self._process.stdin, flush=True)
+                places = self._root or out
+                last, code = _relay(self._process, lambda line: log.write(without_places(line, places)), self._say)
+            if code == UsageError.exit_code:
+                raise UsageError(last.removeprefix("adaafford: "))
+            if code != 0:
+                raise WorkerError(f"the process of {out} ended with code {code}; see {out / OUTPUT_FILE}")
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
         """End it if it still runs: politely, then not."""
-        process = self._process
+        process, self._process = self._process, None
+        if process is None:
+            return
         if process.poll() is None:
             process.terminate()
             try:
@@ -90,54 +94,57 @@ class Child:
                 with suppress(BrokenPipeError):
                     stream.close()
 
-    def _relay(self, write: Callable[[str], object], say: Callable[[str], None]) -> tuple[str, int]:
-        """Pass its lines on; returns the last one and the exit code."""
-        last = ""
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            if line.startswith(ENDED):
-                return last, int(line.removeprefix(ENDED))
-            write(line)
-            last = line.rstrip() or last
-            say(line.rstrip())
-        return last, self._process.wait()
 
-
-def run_child(
-    module: str, arguments: Sequence[str], out: Path, say: Callable[[str], None], root: Path | None = None
-) -> None:
-    """Run `python -m MODULE ARGUMENTS` and wait for its end; see `Child.wait`."""
-    with closing(Child(module, arguments)) as child:
-        child.wait(out, f"python -m {module} {' '.join(arguments)}", say, root)
-
-
-class Learner:
-    """A process that runs training stages one after another, so that it need not read and encode the same twice.
-
-    It begins with the first stage, and ends with `close` or with a stage that fails; the next stage begins another.
-    """
-
-    def __init__(self) -> None:
-        self._child: Child | None = None
-
-    def train(self, arguments: Sequence[str], out: Path, say: Callable[[str], None], root: Path | None = None) -> None:
-        """Run `adaafford train ARGUMENTS`; see `Child.wait`."""
-        if self._child is None:
-            self._child = Child("cluster.learning", told=True)
-        try:
-            self._child.tell(json.dumps(arguments))
-            self._child.wait(out, f"adaafford train {' '.join(arguments)}", say, root)
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """End the process."""
-        if self._child is not None:
-            self._child.close()
-        self._child = None
-
-
-def _environment() -> dict[str, str]:
+def _start() -> "subprocess.Popen[str]":
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(THREADS))
-    return {**own_environment(), **threads, "PYTHONUNBUFFERED": "1"}
+    # A session of its own: Ctrl-C reaches this process alone, which then ends the child in an orderly way.
+    return subprocess.Popen(
+        [*PYTHON, "-m", "cluster.children", str(os.getpid())],
+        env={**own_environment(), **threads, "PYTHONUNBUFFERED": "1"},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        text=True,
+        errors="replace",
+    )
+
+
+def _relay(
+    process: "subprocess.Popen[str]", write: Callable[[str], object], say: Callable[[str], None]
+) -> tuple[str, int]:
+    """Pass its lines on; returns the last one and the exit code."""
+    last = ""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(ENDED):
+            return last, int(line.removeprefix(ENDED))
+        write(line)
+        last = line.rstrip() or last
+        say(line.rstrip())
+    return last, process.wait()
+
+
+def main() -> None:
+    """Be the child: call what comes, until no more can come."""
+    # Here instead of in a `preexec_fn` of the parent, which may deadlock in a process with threads (Linux).
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != int(sys.argv[1]):
+        sys.exit("the parent was gone before the child began")
+    from cluster.cli import begin_process, guarded
+
+    begin_process()
+    for line in sys.stdin:
+        function, arguments = json.loads(line)
+        module, _, name = function.partition(":")
+        code = guarded(partial(_call, module, name, arguments), ["train"])
+        print(f"{ENDED}{code}", flush=True)
+
+
+def _call(module: str, name: str, arguments: Mapping[str, Any]) -> int:
+    getattr(import_module(module), name)(**arguments)
+    return 0
+
+
+if __name__ == "__main__":
+    main()

@@ -12,7 +12,7 @@ from cluster.fleet import Fleet
 from cluster.in_force import PlanInForce
 from cluster.orders import Series
 from cluster.progress import CollectionProgress, Tally, describe_empty
-from cluster.status import DriverStatus, State, StatusKeeper
+from cluster.status import DriverStatus, State, status_kept
 from shared.errors import WorkerError
 from shared.files import process_name
 from shared.plan import Plan, covered, missing_ranges, parse_plan_key
@@ -106,7 +106,7 @@ def collect(
         series = Series(in_force, missing, per_shard, per_version, counts)
         standing = _Standing(plan.key, already, rollouts, progress, fleet, in_force)
         try:
-            with StatusKeeper(store.place, standing, lambda: series.waiting, progress.say):
+            with status_kept(store.place, standing, lambda: series.waiting, progress.say):
                 fleet.run(series, progress)
         except JobError as error:
             command = reproduction(store.where, error.job.shard_id, objects)

@@ -33,6 +33,10 @@ class RolloutCounts(StrictModel):
         """How many rollouts `count` means where there are so many objects."""
         return count * objects if self.per_object else count
 
+    def of_round(self, version: int, objects: int) -> int:
+        """How many rollouts the round of a policy makes on so many objects; version 0 is the random round."""
+        return self.total(self.aip if version else self.random, objects)
+
 
 class SplitConfig(StrictModel):
     """Which objects are trained on: shares within each category, unless lists or categories say what is tested on."""

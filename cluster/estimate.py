@@ -4,20 +4,25 @@ Nothing is simulated and nothing is written. The rates are of one core of the ma
 other machines differ by a factor, the shares of the stages hardly.
 """
 
-from collections.abc import Iterator
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from rich.console import Console
 
+from cluster.campaign import steps_of
+from cluster.children import THREADS
 from cluster.configuration import CampaignConfig
 from cluster.objects import built_in_categories, lists_of, objects_for, split_as_told
 from collector.catalogue import ObjectSplit
+from learner.alternation import AlternationStep, Collect, Train
 from learner.configuration import AffordanceConfig
 from learner.recipes import settings_of, training_of
 from shared.errors import UsageError
-from shared.methods import METHODS, RANDOM, BaselineName, baselines_of
+from shared.formatting import terminal_table
+from shared.methods import METHODS, RANDOM, BaselineName
 from shared.networks.configuration import NetworkConfig
 from shared.plan import ObjectRef
 from shared.policy import Policy
@@ -28,60 +33,41 @@ from shared.vocabulary import Order
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Seconds of one core, and bytes.
+    """Seconds of one core, and bytes."""
 
-    Attributes:
-        measured: when, and on what.
-        push_s: a push at the fast fidelity; likewise of the other primitives that push.
-        pull_s: a pull.
-        reference_push_s: a push at the reference fidelity, whose timing is the published one.
-        reference_pull_s: a pull likewise.
-        object_s: reading an object, and letting a state come to rest.
-        look_s: a depth image and its cloud.
-        write_s: a rollout's share of a shard.
-        multiply_add_s: a multiplication in PointNet++, forward and backward.
-        cloud_s: what a cloud takes beside that.
-        scored_row_s: an action through a critic, forward.
-        trained_row_s: forward and backward.
-        point_bytes: a point of a stored cloud.
-        row_bytes: a stored interaction without its cloud.
-        shard_bytes: what else a shard holds.
-    """
-
-    measured: str
-    push_s: float
-    pull_s: float
-    reference_push_s: float
-    reference_pull_s: float
-    object_s: float
-    look_s: float
-    write_s: float
-    multiply_add_s: float
-    cloud_s: float
-    scored_row_s: float
-    trained_row_s: float
-    point_bytes: float
-    row_bytes: float
-    shard_bytes: float
+    measured: str = (
+        "2026-11-22 on one core of an AMD EPYC (`adaafford bench collect` and `fidelity`; networks by themselves)"
+    )
+    """When, and on what."""
+    push_s: float = 0.0054
+    """A push at the fast fidelity; likewise of the other primitives that push."""
+    pull_s: float = 0.020
+    reference_push_s: float = 0.19
+    """At the reference fidelity, whose timing is the published one."""
+    reference_pull_s: float = 0.40
+    object_s: float = 0.090
+    """Reading an object, and letting a state come to rest."""
+    look_s: float = 0.017
+    """A depth image and its cloud."""
+    write_s: float = 0.022
+    """A rollout's share of a shard."""
+    multiply_add_s: float = 9.1e-11
+    """A multiplication in PointNet++, forward and backward."""
+    cloud_s: float = 0.0085
+    """What a cloud takes beside that."""
+    scored_row_s: float = 5e-6
+    """An action through a critic, forward."""
+    trained_row_s: float = 12e-6
+    """Forward and backward."""
+    point_bytes: float = 9.2
+    """A point of a stored cloud."""
+    row_bytes: float = 385
+    """A stored interaction without its cloud."""
+    shard_bytes: float = 8600
+    """What else a shard holds."""
 
 
-RATES = Rates(
-    measured="2026-11-22 on one core of an AMD EPYC (`adaafford bench collect` and `fidelity`; networks by themselves)",
-    push_s=0.0054,
-    pull_s=0.020,
-    reference_push_s=0.19,
-    reference_pull_s=0.40,
-    object_s=0.090,
-    look_s=0.017,
-    write_s=0.022,
-    multiply_add_s=9.1e-11,
-    cloud_s=0.0085,
-    scored_row_s=5e-6,
-    trained_row_s=12e-6,
-    point_bytes=9.2,
-    row_bytes=385,
-    shard_bytes=8600,
-)
+RATES = Rates()
 FORWARD_SHARE = 0.6
 """Of forward and backward."""
 LEFT_BY_TRAINING = 5
@@ -123,7 +109,8 @@ def estimate(config: CampaignConfig, rates: Rates = RATES) -> Estimate:
     counts = len(parts.train), len(parts.validation), len(parts.test)
     if not counts[0] or not counts[2]:
         raise UsageError(f"{sum(counts)} usable objects are too few to train on some and test on others")
-    return Estimate(config.task, counts, tuple(_Costs(config, counts, rates).stages()))
+    cost = _Costs(config, counts, rates).of
+    return Estimate(config.task, counts, tuple(filter(None, map(cost, steps_of(config)))))
 
 
 def _objects(task: Task, config: CampaignConfig) -> ObjectSplit:
@@ -141,7 +128,7 @@ def _objects(task: Task, config: CampaignConfig) -> ObjectSplit:
 
 
 class _Costs:
-    """The stages of a campaign, one after another."""
+    """What the steps of a campaign cost, asked for one after another."""
 
     def __init__(self, config: CampaignConfig, objects: tuple[int, int, int], rates: Rates) -> None:
         self.config, self.rates = config, rates
@@ -156,25 +143,18 @@ class _Costs:
         self.clouds = 0
         self._rows_a_rollout = config.collection.rollout.interactions
 
-    def stages(self) -> Iterator[StageCost]:
-        """As `cluster.campaign.Campaign.stages` has them; what costs next to nothing is left out."""
-        rollouts, learner = self.config.rollouts, self.config.learner
-        yield self._collection("collect-random", rollouts.total(rollouts.random, self.collected_on), tries=0)
-        adopted = self.config.start_from is not None
-        if not adopted:
-            yield self._training("train-prior", self._prior_s(), encoders=1)
-        for version in range(1, self.config.alternations + 2):
-            if version > 1:
-                count = rollouts.total(rollouts.aip, self.collected_on)
-                yield self._collection(f"collect-aip-{version - 1}", count, self.config.collection.rollout.context)
-            if version > 1 or not adopted:
-                first, own = version == 1, learner.aip.training == "paper"
-                yield self._training(f"train-aap-{version}", self._aap_s(first=first), encoders=1 if first else 2)
-                yield self._training(f"train-aip-{version}", self._aip_s(), encoders=int(own))
-        for name in baselines_of(self.config.evaluation.methods):
-            seconds, encoders = self._baseline_s(name)
-            yield self._training(f"train-{name}", seconds, encoders)
-        yield self._evaluation(rollouts.total(rollouts.evaluation, self.tested))
+    def of(self, step: AlternationStep) -> StageCost | None:
+        """The cost of a step, given those before it; None of one that costs next to nothing."""
+        match step:
+            case Collect(version=version):
+                tries = self.config.collection.rollout.context if version else 0
+                return self._collection(step.name, self.config.rollouts.of_round(version, self.collected_on), tries)
+            case Train():
+                return self._training(step)
+            case AlternationStep(name="evaluate"):
+                rollouts = self.config.rollouts
+                return self._evaluation(rollouts.total(rollouts.evaluation, self.tested))
+        return None
 
     def _collection(self, stage: str, rollouts: int, tries: int) -> StageCost:
         interactions = rollouts * self.config.collection.rollout.interactions
@@ -207,10 +187,19 @@ class _Costs:
             self._stored_bytes(rollouts, interactions, clouds) + self.weights_bytes,
         )
 
-    def _training(self, stage: str, seconds: float, encoders: int) -> StageCost:
+    def _training(self, step: Train) -> StageCost:
         """Its steps, and all clouds under encoders that the stages before it since the last collection did not have."""
+        match step.network:
+            case "prior":
+                seconds, encoders = self._prior_s(), 1
+            case "aap":
+                seconds, encoders = self._aap_s(first=step.round == 1), 1 if step.round == 1 else 2
+            case "aip":
+                seconds, encoders = self._aip_s(), int(self.config.learner.aip.training == "paper")
+            case _:
+                seconds, encoders = self._baseline_s(step.network)
         encoding_s = self.clouds * encoders * FORWARD_SHARE * self.encode_s
-        return StageCost(stage, 0, seconds + encoding_s, LEFT_BY_TRAINING * self.weights_bytes)
+        return StageCost(step.name, 0, seconds + encoding_s, LEFT_BY_TRAINING * self.weights_bytes)
 
     def _prior_s(self) -> float:
         told = self.config.learner.prior
@@ -297,3 +286,43 @@ def multiply_adds(network: NetworkConfig, points: int) -> float:
 
 def _layers(width: int, layers: tuple[int, ...]) -> int:
     return int(np.dot((width, *layers[:-1]), layers))
+
+
+def print_estimate(estimate: Estimate, workers: int, rates: Rates) -> None:
+    """Print the cost of each stage, and of all."""
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
+    train, validation, test = estimate.objects
+    rows, wall_s = [], 0.0
+    for stage in estimate.stages:
+        # Trials are shared by the workers; a network is trained by one process.
+        stage_s = stage.core_s / (max(workers, 1) if stage.interactions else THREADS)
+        wall_s += stage_s
+        shown = f"{stage.interactions:,}" if stage.interactions else "-"
+        rows.append((stage.stage, shown, _hours(stage.core_s), _hours(stage_s), _size(stage.size_bytes)))
+    interactions = sum(stage.interactions for stage in estimate.stages)
+    core_s = sum(stage.core_s for stage in estimate.stages)
+    total = sum(stage.size_bytes for stage in estimate.stages)
+    rows.append(("in all", f"{interactions:,}", _hours(core_s), _hours(wall_s), _size(total)))
+    title = f"{estimate.task}: {train} objects to train on, {validation} to validate, {test} to test"
+    table = terminal_table(title, ("stage", "interactions", "core-hours", "wall hours", "disk"), rows)
+    table.rows[-1].style = "bold"
+    console.print(table)
+    console.print(
+        f"wall hours    with {max(workers, 1)} workers for trials and {THREADS} threads for training\n"
+        f"rates         measured {rates.measured}; expect a factor of two either way\n"
+        "nothing was written",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+def _hours(seconds: float) -> str:
+    hours = seconds / 3600
+    return f"{hours:.2g}" if hours < 1 else f"{hours:,.1f}"
+
+
+def _size(size_bytes: float) -> str:
+    for unit, name in ((1e9, "GB"), (1e6, "MB")):
+        if size_bytes >= unit:
+            return f"{size_bytes / unit:,.1f} {name}"
+    return f"{size_bytes / 1e3:,.0f} KB"

@@ -5,12 +5,15 @@ interactions anew and then acts. So ten trials a shape (AdaAfford, Evaluation Me
 """
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cluster.children import run_child
-from cluster.collection import Collected, OpenFleet, collect
+from cluster.children import Child
+from cluster.collection import Collected, collect
+from cluster.session import Crew
 from shared.errors import UsageError
 from shared.methods import METHODS, versions_of
 from shared.plan import EvaluationConfig, Plan
@@ -52,12 +55,11 @@ class Evaluation:
         assert config is not None, "an evaluation store says what is evaluated"
         return config
 
-    def execute(self, open_fleet: OpenFleet, dismiss: Callable[[], None], say: Callable[[str], None]) -> Collected:
+    def execute(self, crew: Crew, say: Callable[[str], None]) -> Collected:
         """Do what is left of the trials, and write the table.
 
         Args:
-            open_fleet: gives the fleet; not called if no trial is left.
-            dismiss: ends the fleet, since the table wants its cores.
+            crew: executes the trials; dismissed before the table, which wants its cores.
             say: is told what the process that judges prints.
 
         Raises:
@@ -69,10 +71,12 @@ class Evaluation:
             raise UsageError(f"{self.store.where}: holds trials of another policy ({others[0]}); name another folder")
         self._publish()
         with self.store.only_driver():
+            open_fleet = partial(crew.for_store, self.store, self.objects)
             collected = collect(self.store, plan, self.rollouts, self.per_shard, open_fleet, self.objects)
-            dismiss()
-            arguments = [self.store.where, str(self.version), str(self.out), str(self.oracle)]
-            run_child("cluster.judging", arguments, self.out, say, Path(self.policies.where).parent)
+            crew.dismiss()
+            told = {"store": self.store.where, "version": self.version, "out": str(self.out), "aap": str(self.oracle)}
+            with closing(Child(say, Path(self.policies.where).parent)) as child:
+                child.run("cluster.judging:write_judgement", told, self.out)
         return collected
 
     def _publish(self) -> None:

@@ -2,7 +2,6 @@
 
 import hashlib
 import sys
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -12,10 +11,9 @@ from cluster.configuration import CampaignConfig
 from cluster.evaluation import Evaluation
 from cluster.evaluation_settings import EvaluateSettings
 from cluster.evaluation_tables import MARKDOWN_FILE, RESULTS_FILE
-from cluster.fleet import Fleet, make_worker
 from cluster.objects import objects_for
 from cluster.run_folder import ObjectsUsed, RunFolder, find
-from cluster.session import fleets
+from cluster.session import Crew, fleets
 from collector.guard import Limits
 from collector.setting import make_setting
 from shared.errors import UsageError
@@ -71,19 +69,8 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
 def _execute(evaluation: Evaluation, settings: EvaluateSettings) -> None:
     console = Console(file=sys.stderr, highlight=False)
     limits = Limits(settings.rollout_limit_s, settings.memory_limit_mb)
-    made: list[Fleet] = []
     with fleets(settings.workers, limits, settings.ray_address) as make_fleet:
-
-        def open_fleet() -> Fleet:
-            store = evaluation.store
-            made.append(make_fleet(partial(make_worker, store.where, evaluation.objects), store.underway))
-            return made[0]
-
-        def dismiss() -> None:
-            for fleet in made:
-                fleet.close()
-
-        evaluation.execute(open_fleet, dismiss, lambda line: console.print(line, markup=False, soft_wrap=True))
+        evaluation.execute(Crew(make_fleet), lambda line: console.print(line, markup=False, soft_wrap=True))
 
 
 def _version(run: RunFolder, policies: Store, wanted: int | None) -> int:

@@ -1,11 +1,6 @@
-"""Judges a policy on an evaluation store: `python -m cluster.judging STORE VERSION OUT AAP`, a process of its own.
-
-AAP is the folder of the training stage that may have left an oracle; without one the table lacks its row. Like a
-learner it shares a process with neither Ray nor SAPIEN.
-"""
+"""Judges a policy on an evaluation store, in a process of its own: like a trainer, beside neither Ray nor SAPIEN."""
 
 import math
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,21 +9,21 @@ from cluster.evaluation_tables import EvaluationTable, share_of_gap, write_table
 from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD, EvaluationRow, evaluate_store
 from learner.oracle import read_oracle
 from learner.recipes import ORACLE_FILE
-from shared.errors import AdaAffordError
 from shared.formatting import finite
 from shared.policy import Policy
 from shared.store import Store
 
 
-def main(arguments: list[str]) -> int:
-    """Write the table of OUT; returns the exit code."""
-    store, version, out, aap = arguments[0], int(arguments[1]), Path(arguments[2]), Path(arguments[3])
-    try:
-        write_tables(out, judge(Store.open(store), version, aap / ORACLE_FILE))
-    except AdaAffordError as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
-    return 0
+def write_judgement(store: str, version: int, out: str, aap: str) -> None:
+    """Write the table of the folder `out`.
+
+    Args:
+        store: the evaluation store.
+        version: the policy.
+        out: folder of the table.
+        aap: folder of the training that may have left an oracle; without one the table lacks its row.
+    """
+    write_tables(Path(out), judge(Store.open(store), version, Path(aap) / ORACLE_FILE))
 
 
 def judge(store: Store, version: int, oracle: Path) -> EvaluationTable:
@@ -69,7 +64,3 @@ def _gap_closed(row: EvaluationRow, rows: list[EvaluationRow]) -> float:
 
 def _values(row: EvaluationRow) -> dict[str, Any]:
     return {"best_f" if name == "best_f_score" else name: value for name, value in asdict(row).items()}
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

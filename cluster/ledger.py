@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from shared.errors import UsageError
+from shared.heartbeat import Heartbeat
 
 BEAT_S, BEAT_SHARE = 5.0, 0.01
 """A stage under way is noted after so many seconds, or after this share of what the attempt has spent on it if that is
@@ -71,6 +72,22 @@ class Ledger:
         """What a finished stage had to say."""
         return self._results[stage]
 
+    def run(self, stages: Mapping[str, Callable[[], Mapping[str, Any]]], say: Callable[[str], None]) -> None:
+        """Run the stages that are not done yet, in order; each may be run again if a kill comes before its note.
+
+        Args:
+            stages: what to do, by names that are the same in every attempt; each returns its result.
+            say: is told which stage begins, and which were done before.
+        """
+        before = [name for name in stages if name in self._results]
+        if before:
+            say(f"done before: {', '.join(before)}")
+        for number, (name, do) in enumerate(stages.items(), start=1):
+            if name not in before:
+                say(f"stage {number} of {len(stages)}: {name}")
+                with self.stage(name) as done:
+                    done(do())
+
     def note(self, event: str, **details: Any) -> None:
         """Append one event, durably."""
         line = json.dumps({"time": round(time.time(), 3), "event": event, **details}, allow_nan=False)
@@ -95,15 +112,16 @@ class Ledger:
             self._seconds[name] = earlier + self._clock() - begun
             self.note("beat", stage=name, seconds=round(self._seconds[name], 3))
 
+        def background_beat() -> None:
+            # A full disk, say; the end of the stage is noted as well, and fails where that lasts.
+            with suppress(OSError):
+                beat()
+
         self.note("began", stage=name)
-        stop = threading.Event()
-        thread = threading.Thread(target=_repeat, args=(beat, stop), daemon=True)
-        thread.start()
         try:
-            yield lambda result: outcome.append(dict(result))
+            with Heartbeat(background_beat, pause_s, "ledger"):
+                yield lambda result: outcome.append(dict(result))
         finally:
-            stop.set()
-            thread.join()
             beat()
         assert outcome, f"the stage {name} ended without a result"
         self.note("done", stage=name, seconds=round(self._seconds[name], 3), result=outcome[-1])
@@ -143,14 +161,6 @@ class Ledger:
             if isinstance(software, dict) and len(self._software) < MAX_SOFTWARE and software not in self._software:
                 self._software.append({str(name): str(version)[:MAX_VERSION] for name, version in software.items()})
         lines.clear()
-
-
-def _repeat(beat: Callable[[], None], stop: threading.Event) -> None:
-    begun = time.monotonic()
-    while not stop.wait(pause_s(time.monotonic() - begun)):
-        # A full disk, say; the end of the stage is noted as well, and fails where that lasts.
-        with suppress(OSError):
-            beat()
 
 
 def pause_s(spent_s: float) -> float:

@@ -88,7 +88,7 @@ def source_of_training(training: Path, store: Store, results: Path | None, origi
         UsageError: the training is not finished, or was of another task.
         StoreError: what it left is damaged.
     """
-    folder = trained_in(training).policy
+    folder = trained_in(training)
     policy, seen = read_policy_folder(folder), objects_seen(folder)
     if policy.task != store.setting.task:
         raise UsageError(f"{training}: a policy for '{policy.task}', but the store is of '{store.setting.task}'")

@@ -13,18 +13,20 @@ import socket
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import psutil
 
-from cluster.fleet import Fleet, SerialFleet
+from cluster.fleet import Fleet, SerialFleet, make_worker
 from collector.guard import Limits
 from collector.receipt import WorkerFactory
 from shared.errors import StoreError, UsageError, WorkerError
 from shared.extras import require_packages
 from shared.files import is_gone, process_name, read_bounded, remove_if_abandoned, remove_tree, temporary_name
 from shared.private import private_folder
+from shared.store import Store
 from shared.underway import Underway
 
 OBJECT_STORE_BYTES = 128 << 20
@@ -59,6 +61,29 @@ FleetMaker = Callable[[WorkerFactory, Underway], Fleet]
 """Makes a fleet whose workers leave their breadcrumbs there."""
 
 logger = logging.getLogger(__name__)
+
+
+class Crew:
+    """The live fleet: one at a time, since each worker holds a CPU; kept as long as the store stays the same."""
+
+    def __init__(self, make_fleet: FleetMaker) -> None:
+        self._make_fleet = make_fleet
+        self._fleet: Fleet | None = None
+        self._of: tuple[str, Path] | None = None
+
+    def for_store(self, store: Store, objects: Path) -> Fleet:
+        """The fleet whose workers write to `store`."""
+        if self._fleet is None or self._of != (store.where, objects):
+            self.dismiss()
+            self._fleet = self._make_fleet(partial(make_worker, store.where, objects), store.underway)
+            self._of = store.where, objects
+        return self._fleet
+
+    def dismiss(self) -> None:
+        """End the workers."""
+        if self._fleet is not None:
+            self._fleet.close()
+        self._fleet = None
 
 
 @contextmanager

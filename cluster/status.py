@@ -7,9 +7,8 @@ after the driver has ended.
 """
 
 import logging
-import threading
-from collections.abc import Callable
-from types import TracebackType
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Literal
 
 from pydantic import Field, ValidationError
@@ -17,6 +16,7 @@ from pydantic import Field, ValidationError
 from shared.configuration import StrictModel
 from shared.errors import StoreError
 from shared.files import is_gone
+from shared.heartbeat import Heartbeat
 from shared.store.layout import STATUS_FOLDER
 from shared.store.place import Place
 
@@ -103,8 +103,15 @@ def read_status(place: Place) -> DriverStatus | None:
         return None
 
 
-class StatusKeeper:
-    """Writes how a collection stands, in the background; use as a context.
+@contextmanager
+def status_kept(
+    place: Place,
+    stand: Callable[[State], DriverStatus],
+    is_waiting: Callable[[], bool],
+    say: Callable[[str], None],
+    beat_s: float = BEAT_S,
+) -> Iterator[None]:
+    """Write how a collection stands, in the background for as long as the context lasts, and how it ended.
 
     Args:
         place: of the store.
@@ -113,52 +120,27 @@ class StatusKeeper:
         say: is told when that begins.
         beat_s: how often.
     """
+    before: State = "collecting"
 
-    def __init__(
-        self,
-        place: Place,
-        stand: Callable[[State], DriverStatus],
-        is_waiting: Callable[[], bool],
-        say: Callable[[str], None],
-        beat_s: float = BEAT_S,
-    ) -> None:
-        self._place = place
-        self._stand = stand
-        self._is_waiting = is_waiting
-        self._say = say
-        self._beat_s = beat_s
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._repeat, name="status", daemon=True)
-
-    def __enter__(self) -> "StatusKeeper":
-        """Begin."""
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Write once more, how it ended."""
-        self._stop.set()
-        self._thread.join()
-        self._write("done" if kind is None else "stopped")
-
-    def _repeat(self) -> None:
-        before: State = "collecting"
-        while True:
-            state: State = "waiting" if self._is_waiting() else "collecting"
-            if state == "waiting" != before:
-                self._say(
-                    f"waiting for a newer policy in {self._place.where}; `adaafford learn --follow` publishes them"
-                )
-            before = state
-            self._write(state)
-            if self._stop.wait(self._beat_s):
-                return
-
-    def _write(self, state: State) -> None:
+    def write(state: State) -> None:
         try:
-            self._place.replace(_KEY, self._stand(state).model_dump_json(indent=1).encode())
+            place.replace(_KEY, stand(state).model_dump_json(indent=1).encode())
         except (StoreError, OSError) as error:
             # Nothing depends on it; where the store itself is out of reach, the workers say so.
             logger.info("the status cannot be written (%s)", error)
+
+    def beat() -> None:
+        nonlocal before
+        state: State = "waiting" if is_waiting() else "collecting"
+        if state == "waiting" != before:
+            say(f"waiting for a newer policy in {place.where}; `adaafford learn --follow` publishes them")
+        before = state
+        write(state)
+
+    ended: State = "stopped"
+    try:
+        with Heartbeat(beat, lambda _: beat_s, "status", at_once=True):
+            yield
+        ended = "done"
+    finally:
+        write(ended)

@@ -1,95 +1,196 @@
-"""The alternation: prior, AAP, AIP, then AAP fine-tuned and AIP again, until that brings no more.
+"""The alternation of AdaAfford: rollouts, the prior, AAP, AIP, a policy; then rollouts of that policy, and so on.
 
-RUN/ of an alternation
-    prior/, aap-1/, aip-1/, aap-2/, ...   one folder a stage (see `learner.stages`), each resumable by itself
+    collect-random, train-prior,
+    train-aap-1, train-aip-1, publish-1,
+    collect-aip-1, train-aap-2, train-aip-2, publish-2, ...
+
+`alternation` is this order. `perform` does one of its steps. Where the rollouts come from is up to `Rollouts`: a store
+that grows no more (`Finished`), collectors that work beside the learner (`learner.following`), or a campaign, which
+collects them itself (`cluster.campaign`).
+
+RUN/ of `alternate`
+    prior/, aap-1/, aip-1/, aap-2/, ...   one folder a training (see `learner.stages`), each resumable by itself
     alternation.json                      the rounds, which of them is the best, and why they ended; written last
-
-What each round learns from is up to `Rounds`: of a finished store (`Finished`), or of one that still grows
-(`learner.following`).
 """
 
 import json
 import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from pydantic import BaseModel, Field
 
 from learner import sharing
 from learner.configuration import AlternationConfig, LearnerConfig
 from learner.hardware import Hardware
-from learner.recipes import ORACLE_FILE
 from learner.stages import DONE_FILE, MAX_DONE_BYTES, Memory, StageJob, StageName, read_done, run_stage
 from shared.documents import read_document
 from shared.errors import StoreError, UsageError
 from shared.files import write_atomically
+from shared.methods import BaselineName
 from shared.plan import parse_plan_key
-from shared.policy import Policy
 from shared.store.store import Store
 
 ALTERNATION_FILE = "alternation.json"
+ADOPTED = "adopted"
+"""Folder of a policy that stands in the place of the first round's."""
 
 
 @dataclass(frozen=True, slots=True)
-class Round:
-    """One AAP and the AIP that was trained for it.
+class AlternationStep:
+    """One step of an alternation, or of what is around it.
 
     Attributes:
-        number: from 1.
-        score: best validation loss of AAP, nats.
+        name: unique, and the same in every attempt: what a run's log calls it.
     """
 
-    number: int
-    score: float
+    name: str
 
 
-class Rounds(Protocol):
-    """What the rounds of an alternation learn from, and what becomes of their policies."""
+@dataclass(frozen=True, slots=True)
+class Collect(AlternationStep):
+    """Rollouts whose interactions policy `version` proposed; 0 stands for random ones."""
 
-    at_least: int
-    """Rounds that it takes to have learnt from all that is there."""
+    version: int
 
-    def data(self, job: StageJob, number: int) -> StageJob:
-        """The job with what round `number`, from 1, learns from, the prior being 0; waits until there is enough."""
+    @property
+    def proposer(self) -> str:
+        """Who proposes."""
+        return "aip" if self.version else "random"
+
+
+@dataclass(frozen=True, slots=True)
+class Train(AlternationStep):
+    """The training of one network.
+
+    Attributes:
+        network: which one.
+        round: from 1; 0 is the prior.
+        folder: what the folder is called that gets the policy.
+        init: the folder of the policy that it starts from; None: whatever the alternation itself starts from.
+    """
+
+    network: StageName
+    round: int
+    folder: str
+    init: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Publish(AlternationStep):
+    """The policy in `folder` becomes version `version`, which proposes from then on."""
+
+    version: int
+    folder: str
+
+
+def alternation(
+    goes_on: Callable[[int], bool], *, adopts: bool = False, baselines: Sequence[BaselineName] = ()
+) -> Iterator[AlternationStep]:
+    """The steps of an alternation, in order.
+
+    Args:
+        goes_on: whether another round follows when so many have been trained.
+        adopts: whether a policy is there that stands in the place of the first round's.
+        baselines: networks that are added to the last policy.
+    """
+
+    def train(network: StageName, number: int, folder: str, init: str | None) -> Train:
+        return Train(f"train-{folder}", network, number, folder, init)
+
+    yield Collect("collect-random", 0)
+    yield AlternationStep("adopt") if adopts else train("prior", 0, "prior", None)
+    left, number, more = ADOPTED if adopts else "prior", 0, True
+    while more:
+        number += 1
+        if number > 1:
+            yield Collect(f"collect-aip-{number - 1}", number - 1)
+        if number > 1 or not adopts:
+            yield train("aap", number, f"aap-{number}", left)
+            yield train("aip", number, f"aip-{number}", f"aap-{number}")
+            left = f"aip-{number}"
+        more = goes_on(number)
+        for name in () if more else baselines:
+            yield train(name, number, name, left)
+            left = name
+        yield Publish(f"publish-{number}", number, left)
+
+
+class Rollouts(Protocol):
+    """Where the rollouts of an alternation come from, and where its policies go."""
+
+    def collect(self, step: Collect) -> Mapping[str, Any]:
+        """See that the rollouts of a policy version are there; returns what to note of it."""
         ...
 
-    def done(self, number: int, policy: Path) -> None:
-        """Take note that a round has left its policy in a folder."""
+    def job(self, number: int) -> StageJob:
+        """What round `number` learns from, the prior being 0; `out` is the folder around those of all trainings."""
         ...
+
+    def publish(self, step: Publish) -> Mapping[str, Any]:
+        """Take a policy; returns what to note of it."""
+        ...
+
+
+def perform(step: AlternationStep, rollouts: Rollouts, train: Callable[[StageJob], object]) -> Mapping[str, Any]:
+    """Do one step of an alternation, which may have been done before; returns what to note of it.
+
+    Args:
+        step: of `alternation`.
+        rollouts: where they come from.
+        train: runs a training, or goes on with it, or finds it done.
+    """
+    match step:
+        case Collect():
+            return rollouts.collect(step)
+        case Publish():
+            return rollouts.publish(step)
+        case Train(network=network, folder=folder):
+            job = rollouts.job(step.round)
+            init = job.init if step.init is None else job.out / step.init
+            train(replace(job, stage=network, out=job.out / folder, init=init))
+            return {"policy_folder": f"{job.out.name}/{folder}"}
+    raise ValueError(f"'{step.name}' is no step of an alternation")
 
 
 class Finished:
-    """The rounds of a store that grows no more.
+    """`Rollouts` of a store that grows no more; policies stay in their folders.
 
-    Where it holds rounds that policies proposed, round V of training learns from what versions below V proposed, as a
-    campaign would have had it (AdaAfford, Training Strategy); later rounds, from all rows.
+    Where the store holds rollouts that policies proposed, round V of training learns from what versions below V
+    proposed, as a campaign would have had it (AdaAfford, Training Strategy); later rounds, from all rows.
+
+    Args:
+        job: the store and the learner's folder.
+
+    Attributes:
+        out: the learner's folder.
+        at_least: rounds that it takes to have learnt from all that is there.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._newest = newest_policy(store)
+    def __init__(self, job: StageJob) -> None:
+        self._job, self.out = job, job.out
+        self._store = Store.open(job.store)
+        # By the names of shards, which say it also where the file of a plan was lost.
+        self._newest = max((parse_plan_key(each.plan_key)[1] for each in self._store.jobs()), default=0)
         self.at_least = self._newest + 1
 
-    def data(self, job: StageJob, number: int) -> StageJob:
-        """See `Rounds.data`."""
-        return replace(job, newest_policy=number - 1) if 1 <= number <= self._newest else job
+    def collect(self, step: Collect) -> Mapping[str, Any]:
+        """See `Rollouts.collect`."""
+        return {}
 
-    def done(self, number: int, policy: Path) -> None:
-        """See `Rounds.done`."""
+    def job(self, number: int) -> StageJob:
+        """See `Rollouts.job`."""
+        return replace(self._job, newest_policy=number - 1) if 1 <= number <= self._newest else self._job
 
-
-@dataclass(frozen=True, slots=True)
-class Best:
-    """The best round's policy, and the folder that it lies in."""
-
-    policy: Policy
-    folder: Path
+    def publish(self, step: Publish) -> Mapping[str, Any]:
+        """See `Rollouts.publish`."""
+        return {}
 
 
-def alternate(
-    job: StageJob, config: LearnerConfig, hardware: Hardware | None = None, rounds: Rounds | None = None
-) -> Best:
-    """Train rounds until they bring no more, or go on with them after a kill; returns what the best of them made.
+def alternate(rollouts: Finished, config: LearnerConfig, hardware: Hardware | None = None) -> Path:
+    """Train rounds until they bring no more, or go on with them after a kill; returns the folder of the best policy.
 
     A round counts if it lowers the best validation loss of AAP by more than `config.alternation.improvement` of it. The
     rounds end when `patience` of them in a row did not count and every round of the store has been learnt from.
@@ -98,27 +199,24 @@ def alternate(
         UsageError: see `run_stage`.
         StoreError: see `run_stage`.
     """
-    hardware, memory = hardware or Hardware(), Memory()
-    rounds = rounds or Finished(Store.open(job.store))
-    last = _run(rounds.data(job, 0), config, hardware, memory, "prior", "prior", job.init)
-    trained: list[Round] = []
-    policies: list[Policy] = []
-    while not converged([found.score for found in trained], config.alternation, rounds.at_least):
-        number = len(trained) + 1
-        seen = rounds.data(job, number)
-        aap = _run(seen, config, hardware, memory, "aap", f"aap-{number}", last[0])
-        last = _run(seen, config, hardware, memory, "aip", f"aip-{number}", aap[0])
-        policies.append(last[1])
-        trained.append(Round(number, best_score(aap[0])))
-        rounds.done(number, last[0])
-    best = min(trained, key=lambda found: found.score)
+    memory, out = Memory(), rollouts.out
+    scores: list[float] = []
+
+    def goes_on(number: int) -> bool:
+        scores.append(best_score(out / f"aap-{number}"))
+        return not converged(scores, config.alternation, rollouts.at_least)
+
+    for step in alternation(goes_on):
+        perform(step, rollouts, lambda job: run_stage(job, config, hardware, memory))
+    best = scores.index(min(scores)) + 1
     if sharing.rank() == 0:
-        told = {"rounds": [{"round": r.number, "score": r.score} for r in trained], "best": best.number}
-        told["converged"] = len(trained) < config.alternation.rounds
-        write_atomically(job.out / ALTERNATION_FILE, json.dumps(told, indent=1).encode())
-        why = "converged" if told["converged"] else "no more rounds allowed"
-        print(f"{job.out}: {why} after {len(trained)}; the best policy is {job.out / f'aip-{best.number}'}", flush=True)
-    return Best(policies[best.number - 1], job.out / f"aip-{best.number}")
+        rounds = [{"round": number, "score": score} for number, score in enumerate(scores, start=1)]
+        ended_early = len(scores) < config.alternation.rounds
+        told = {"rounds": rounds, "best": best, "converged": ended_early}
+        write_atomically(out / ALTERNATION_FILE, json.dumps(told, indent=1).encode())
+        why = "converged" if ended_early else "no more rounds allowed"
+        print(f"{out}: {why} after {len(scores)}; the best policy is {out / f'aip-{best}'}", flush=True)
+    return out / f"aip-{best}"
 
 
 def converged(scores: list[float], config: AlternationConfig, at_least: int) -> bool:
@@ -139,50 +237,26 @@ def converged(scores: list[float], config: AlternationConfig, at_least: int) -> 
     return len(scores) >= at_least and misses >= config.patience
 
 
-def newest_policy(store: Store) -> int:
-    """The newest version of a policy that proposed rows of a store; 0 where all are random."""
-    # By the names of shards, which say it also where the file of a plan was lost.
-    return max((parse_plan_key(job.plan_key)[1] for job in store.jobs()), default=0)
-
-
 class AlternationRecord(BaseModel):
     """What is read again of an alternation's record."""
 
     best: int = Field(ge=1, le=1000)
 
 
-@dataclass(frozen=True, slots=True)
-class Trained:
-    """Where a training left what it made.
-
-    Attributes:
-        policy: the folder of the stage whose policy is its best.
-        oracle: the file of its oracle critic, where privileged training left one.
-    """
-
-    policy: Path
-    oracle: Path | None
-
-
-def trained_in(out: Path) -> Trained:
-    """What the --out of an alternation, or of a single stage, holds.
+def trained_in(out: Path) -> Path:
+    """The folder of the best policy in the --out of an alternation, or of a single stage.
 
     Raises:
         UsageError: no finished training.
         StoreError: its record is damaged.
     """
-    record = out / ALTERNATION_FILE
+    record, policy = out / ALTERNATION_FILE, out
     if record.is_file():
-        told = read_document(
-            AlternationRecord, record, MAX_DONE_BYTES, "damaged; the same training again writes it anew"
-        )
-        policy = out / f"aip-{told.best}"
-    else:
-        policy = out
+        advice = "damaged; the same training again writes it anew"
+        policy = out / f"aip-{read_document(AlternationRecord, record, MAX_DONE_BYTES, advice).best}"
     if not (policy / DONE_FILE).is_file():
         raise UsageError(f"{out}: holds no finished training; name the --out of `adaafford train alternate` or aap")
-    oracle = policy / ORACLE_FILE
-    return Trained(policy, oracle if oracle.is_file() else None)
+    return policy
 
 
 def best_score(folder: Path) -> float:
@@ -195,16 +269,3 @@ def best_score(folder: Path) -> float:
     if score is None:
         raise StoreError(f"{folder / DONE_FILE}: damaged; remove the folder to train this stage again")
     return score
-
-
-def _run(
-    job: StageJob,
-    config: LearnerConfig,
-    hardware: Hardware,
-    memory: Memory,
-    stage: StageName,
-    folder: str,
-    init: Path | None,
-) -> tuple[Path, Policy]:
-    out = job.out / folder
-    return out, run_stage(replace(job, stage=stage, out=out, init=init), config, hardware, memory)

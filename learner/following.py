@@ -11,14 +11,15 @@ no object moves from one side to the other.
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field, RootModel
 
 from learner import sharing
+from learner.alternation import Collect, Finished, Publish
 from learner.configuration import PUBLISHED_FILE
 from learner.data import kept_for_validation
 from learner.stages import StageJob
@@ -51,59 +52,68 @@ class Pace:
     poll_s: float = 5.0
 
 
-class Following:
-    """See `learner.alternation.Rounds`.
+class Following(Finished):
+    """`Rollouts` of a store that collectors fill meanwhile; each round's policy is published for them.
 
     Args:
-        store: folder or URL; it need not be there yet.
-        out: the learner's folder.
+        job: the store, which need not be there yet, and the learner's folder.
         pace: when there is enough.
         sleep: waits for so many seconds.
     """
 
-    at_least = 1
-
-    def __init__(self, store: str | Path, out: Path, pace: Pace, sleep: Callable[[float], None] = time.sleep) -> None:
-        self._out = out
+    def __init__(self, job: StageJob, pace: Pace, sleep: Callable[[float], None] = time.sleep) -> None:
         self._pace = pace
         self._sleep = sleep
-        self._store = self._wait_for_store(store)
-        out.mkdir(parents=True, exist_ok=True)
+        self._wait_for_store(job.store)
+        super().__init__(job)
+        # What a round learns from is a snapshot of all that there is.
+        self.at_least = 1
+        if job.train_objects is None and job.validation_objects is None:
+            named = [ref.id for ref in self._store.setting.objects]
+            self._job = replace(job, validation_objects=kept_for_validation(named))
+        job.out.mkdir(parents=True, exist_ok=True)
 
-    def data(self, job: StageJob, number: int) -> StageJob:
-        """The job with what the store holds, once that is enough; the prior learns from what round 1 does.
+    def collect(self, step: Collect) -> Mapping[str, Any]:
+        """Wait until collectors have made enough for the round after `step.version`, and note what there is.
 
         Raises:
             StoreError: the store is damaged.
         """
-        number = max(number, 1)
-        if job.train_objects is None and job.validation_objects is None:
-            named = [ref.id for ref in self._store.setting.objects]
-            job = replace(job, validation_objects=kept_for_validation(named))
-        path = self._out / f"data-{number}.json"
+        path = self._snapshot(step.version + 1)
         if sharing.rank() == 0 and not path.exists():
-            write_atomically(path, self._wait_for_rollouts(job, number).model_dump_json().encode())
+            write_atomically(path, self._wait_for_rollouts(step.version + 1).model_dump_json().encode())
         while not path.exists():
             # Not a barrier, which would lose patience: collection may take hours.
             self._sleep(self._pace.poll_s)
-        return replace(job, snapshot=_read_snapshot(path))
+        return {}
 
-    def done(self, number: int, policy: Path) -> None:
+    def job(self, number: int) -> StageJob:
+        """What the store held as the round began; the prior learns from what round 1 does.
+
+        Raises:
+            StoreError: the record of that is damaged.
+        """
+        return replace(self._job, snapshot=_read_snapshot(self._snapshot(max(number, 1))))
+
+    def publish(self, step: Publish) -> Mapping[str, Any]:
         """Publish the policy of a round."""
-        publish(self._store, self._out, f"round-{number}", policy)
+        publish(self._store, self.out, f"round-{step.version}", self.out / step.folder)
+        return {}
 
-    def _wait_for_store(self, where: str | Path) -> Store:
+    def _snapshot(self, number: int) -> Path:
+        return self.out / f"data-{number}.json"
+
+    def _wait_for_store(self, where: str | Path) -> None:
         place, said = place_of(where), False
         while not (place.is_there() and place.exists(STORE_FILE)):
             if not said and sharing.rank() == 0:
                 print(f"waiting for a store in {where}", flush=True)
             said = True
             self._sleep(self._pace.poll_s)
-        return Store.open(where)
 
-    def _wait_for_rollouts(self, job: StageJob, number: int) -> Snapshot:
+    def _wait_for_rollouts(self, number: int) -> Snapshot:
         """What the store holds once that is enough for the round."""
-        before = 0 if number == 1 else _read_snapshot(self._out / f"data-{number - 1}.json").rollouts
+        before = 0 if number == 1 else _read_snapshot(self._snapshot(number - 1)).rollouts
         wanted = self._pace.first if number == 1 else before + self._pace.more
         said_at = -LINE_S
         while True:
@@ -111,7 +121,7 @@ class Following:
             if there >= wanted:
                 snapshot = Snapshot.of(self._store.parts())
                 there = snapshot.rollouts
-                if there >= wanted and self._has_both_sides(snapshot, job):
+                if there >= wanted and self._has_both_sides(snapshot):
                     return snapshot
             if time.monotonic() - said_at >= LINE_S:
                 said_at = time.monotonic()
@@ -119,11 +129,11 @@ class Following:
                 print(f"round {number} waits for {what} in {self._store.where}; {there} rollouts are there", flush=True)
             self._sleep(self._pace.poll_s)
 
-    def _has_both_sides(self, snapshot: Snapshot, job: StageJob) -> bool:
+    def _has_both_sides(self, snapshot: Snapshot) -> bool:
         """Whether something was tried on objects to learn from, and on objects to judge by."""
         rows = self._store.as_of(snapshot).interactions(["object_id"])
         objects = set(rows.column("object_id").unique().to_pylist())
-        train, validation = job.train_objects, job.validation_objects
+        train, validation = self._job.train_objects, self._job.validation_objects
         learnt_from = objects - set(validation or ()) if train is None else objects & set(train)
         judged_by = objects - set(train or ()) if validation is None else objects & set(validation)
         return bool(learnt_from and judged_by)

@@ -15,19 +15,21 @@ OUT/ of a stage
 
 import hashlib
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, TypeAdapter
 
 from learner import sharing
 from learner.checkpoint import check_fingerprint, read_cursor
 from learner.configuration import METRICS_FILE, LearnerConfig
 from learner.data import Dataset, Split, load_dataset, split, without_later
 from learner.features import FrozenFeatures
-from learner.hardware import Hardware
+from learner.hardware import Hardware, hardware
 from learner.oracle import read_oracle
 from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FILE, ORACLE_FOLDER, Recipe, Runner
 from learner.training import CHECKPOINT_FILE, TrainingResult
@@ -89,10 +91,13 @@ class StageJob:
     store: str | Path
     out: Path
     init: Path | None = None
-    train_objects: Collection[str] | None = None
-    validation_objects: Collection[str] | None = None
+    train_objects: frozenset[str] | None = None
+    validation_objects: frozenset[str] | None = None
     snapshot: Snapshot | None = None
     newest_policy: int | None = None
+
+
+_JOB = TypeAdapter(StageJob)
 
 
 class Memory:
@@ -160,6 +165,23 @@ def run_stage(
         _train(job, config, store, policy, oracle, fingerprint, hardware or Hardware(), memory or Memory())
     _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
     return policy
+
+
+def as_json(job: StageJob, config: LearnerConfig) -> dict[str, Any]:
+    """A stage as a message to another process, which calls `run_from_json` with it."""
+    return {"job": _JOB.dump_python(job, mode="json"), "config": config.model_dump(mode="json")}
+
+
+def run_from_json(job: Mapping[str, Any], config: Mapping[str, Any]) -> None:
+    """Run a stage in a process that runs one after another; raises as `run_stage` does."""
+    settings = LearnerConfig.model_validate(config)
+    with hardware(settings) as used:
+        run_stage(_JOB.validate_python(job), settings, used, _memory())
+
+
+@cache
+def _memory() -> Memory:
+    return Memory()
 
 
 def _train(

@@ -218,6 +218,10 @@ def _read_all(descriptor: int, limit: int, most: int) -> bytes:
     return b"".join(pieces)
 
 
+DRIVER_LOCK = ".lock-driver"
+"""What a driver holds of its run or learner's folder: two of them would do everything twice."""
+
+
 @contextmanager
 def exclusive_lock(path: Path, wait_seconds: float = 0.0) -> Iterator[None]:
     """Hold a file's lock; the kernel gives it back when the holder dies, however it dies.

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from cluster.campaign import Campaign, Crew
+from cluster.campaign import steps_of
 from cluster.collection import collect
 from cluster.configuration import CampaignConfig
 from cluster.fleet import Fleet, SerialFleet
-from cluster.locking import only_driver
 from cluster.progress import CollectionProgress
-from cluster.run_folder import RunFolder
+from cluster.session import Crew
 from collector.guard import UnderWay
 from collector.receipt import Receipt, WorkerFactory
 from shared.errors import StoreError, UsageError, WorkerError
+from shared.files import DRIVER_LOCK, exclusive_lock
 from shared.plan import Job, Plan
 from shared.progress import LINE_EVERY_S
 from shared.store import Store, verify
@@ -91,21 +91,21 @@ def test_a_policy_that_is_not_there_is_refused(store: Store) -> None:
 
 def test_a_second_driver_is_refused_while_the_first_lives(tmp_path: Path) -> None:
     script = (
-        "import sys, pathlib; from cluster.locking import only_driver\n"
-        "with only_driver(pathlib.Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+        "import sys, pathlib; from shared.files import DRIVER_LOCK, exclusive_lock\n"
+        "with exclusive_lock(pathlib.Path(sys.argv[1]) / DRIVER_LOCK): print('held', flush=True); sys.stdin.read()"
     )
     first = subprocess.Popen(
         [sys.executable, "-c", script, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert first.stdin is not None and first.stdout is not None
     assert first.stdout.readline() == "held\n"
-    with pytest.raises(UsageError, match=f"in use by process {first.pid}"), only_driver(tmp_path):
+    with pytest.raises(UsageError, match=f"in use by process {first.pid}"), exclusive_lock(tmp_path / DRIVER_LOCK):
         pass
     first.kill()
     first.wait()
     first.stdin.close()
     first.stdout.close()
-    with only_driver(tmp_path):
+    with exclusive_lock(tmp_path / DRIVER_LOCK):
         pass
 
 
@@ -151,9 +151,8 @@ def test_the_same_live_fleet_serves_all_rounds_of_a_store(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("alternations", [0, 1, 2])
-def test_every_policy_is_published_before_it_is_used(tmp_path: Path, alternations: int) -> None:
-    campaign = Campaign(RunFolder(tmp_path), CampaignConfig(alternations=alternations))
-    names = [stage.name for stage in campaign.stages(Crew(lambda factory: FakeFleet()))]
+def test_every_policy_is_published_before_it_is_used(alternations: int) -> None:
+    names = [step.name for step in steps_of(CampaignConfig(alternations=alternations))]
     assert names[:3] == ["objects", "collect-random", "train-prior"]
     assert names[-2:] == ["evaluate", "report"]
     assert sum(name.startswith("publish-") for name in names) == alternations + 1
@@ -190,7 +189,7 @@ def test_a_killed_campaign_ends_as_an_unkilled_one(tmp_path: Path) -> None:
 
 
 def adaafford(folder: Path, command: str, run: Path, workers: str) -> "subprocess.Popen[bytes]":
-    from cluster.training import as_toml
+    from tests.as_toml import as_toml
 
     (folder / "small.toml").write_text(as_toml(SMALL))
     where = [str(run)] if command == "resume" else ["--out", str(run), "--config", str(folder / "small.toml")]

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cluster.ledger import BEAT_SHARE, Ledger, pause_s
-from cluster.stages import Stage, run_stages
 
 
 class FakeClock:
@@ -21,7 +20,10 @@ class FakeClock:
         return self.now
 
 
-def stage(name: str, log: list[str], clock: FakeClock, fails: bool = False) -> Stage:
+Stages = dict[str, Callable[[], Mapping[str, Any]]]
+
+
+def stage(name: str, log: list[str], clock: FakeClock, fails: bool = False) -> Stages:
     def run() -> Mapping[str, Any]:
         clock.now += 10
         log.append(name)
@@ -29,19 +31,23 @@ def stage(name: str, log: list[str], clock: FakeClock, fails: bool = False) -> S
             raise RuntimeError("killed")
         return {"made": name}
 
-    return Stage(name, run)
+    return {name: run}
+
+
+def abc(log: list[str], clock: FakeClock) -> Stages:
+    return stage("a", log, clock) | stage("b", log, clock) | stage("c", log, clock)
 
 
 def test_each_stage_runs_once_however_often_the_run_stops(tmp_path: Path) -> None:
     log: list[str] = []
     clock, said = FakeClock(), list[str]()
-    stages = [stage("a", log, clock), stage("b", log, clock, fails=True), stage("c", log, clock)]
+    stages = stage("a", log, clock) | stage("b", log, clock, fails=True) | stage("c", log, clock)
     for _ in range(2):
         with pytest.raises(RuntimeError):
-            run_stages(stages, Ledger(tmp_path / "log.jsonl", clock), said.append)
-    stages[1] = stage("b", log, clock)
-    run_stages(stages, Ledger(tmp_path / "log.jsonl", clock), said.append)
-    run_stages(stages, Ledger(tmp_path / "log.jsonl", clock), said.append)
+            Ledger(tmp_path / "log.jsonl", clock).run(stages, said.append)
+    stages |= stage("b", log, clock)
+    Ledger(tmp_path / "log.jsonl", clock).run(stages, said.append)
+    Ledger(tmp_path / "log.jsonl", clock).run(stages, said.append)
     assert log == ["a", "b", "b", "b", "c"]
     assert said[-1] == "done before: a, b, c"
 
@@ -49,9 +55,9 @@ def test_each_stage_runs_once_however_often_the_run_stops(tmp_path: Path) -> Non
 def test_wall_time_is_added_up_over_attempts(tmp_path: Path) -> None:
     clock, log = FakeClock(), list[str]()
     with pytest.raises(RuntimeError):
-        run_stages([stage("b", log, clock, fails=True)], Ledger(tmp_path / "log.jsonl", clock), log.append)
+        Ledger(tmp_path / "log.jsonl", clock).run(stage("b", log, clock, fails=True), log.append)
     ledger = Ledger(tmp_path / "log.jsonl", clock)
-    run_stages([stage("b", log, clock)], ledger, log.append)
+    ledger.run(stage("b", log, clock), log.append)
     assert ledger.seconds == {"b": 20.0} == Ledger(tmp_path / "log.jsonl").seconds
     assert ledger.result("b") == {"made": "b"} == Ledger(tmp_path / "log.jsonl").result("b")
 
@@ -61,14 +67,14 @@ def test_wall_time_is_added_up_over_attempts(tmp_path: Path) -> None:
 def test_a_torn_log_loses_at_most_its_last_line(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
     path = tmp_path_factory.mktemp("ledger") / "log.jsonl"
     clock = FakeClock()
-    run_stages([stage(name, [], clock) for name in "abc"], Ledger(path, clock), lambda line: None)
+    Ledger(path, clock).run(abc([], clock), lambda line: None)
     whole = path.read_bytes()
     path.write_bytes(whole[: min(cut, len(whole))])
     before = Ledger(path, clock).finished
     assert before == tuple("abc")[: len(before)]
     assert len(before) >= path.read_bytes().count(b'"done"') - 1
     log: list[str] = []
-    run_stages([stage(name, log, clock) for name in "abc"], Ledger(path, clock), lambda line: None)
+    Ledger(path, clock).run(abc(log, clock), lambda line: None)
     assert (*before, *log) == ("a", "b", "c") == Ledger(path).finished
 
 
@@ -83,7 +89,7 @@ def test_a_stage_under_way_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         seen.append(Ledger(path).seconds["a"])
         return {}
 
-    run_stages([Stage("a", run)], Ledger(path, clock), lambda line: None)
+    Ledger(path, clock).run({"a": run}, lambda line: None)
     assert seen == [7.0]
 
 
@@ -137,7 +143,7 @@ def test_a_log_that_cannot_be_written_for_a_while_ends_nothing(
         wait_until(lambda: bool(failed))
         return {}
 
-    run_stages([Stage("a", run)], ledger, lambda line: None)
+    ledger.run({"a": run}, lambda line: None)
     assert ledger.finished == ("a",)
     assert "Traceback" not in capfd.readouterr().err
 

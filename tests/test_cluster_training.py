@@ -6,15 +6,13 @@ import subprocess
 import sys
 import textwrap
 import time
-import tomllib
+from contextlib import closing
 from pathlib import Path
 
 import psutil
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from cluster import children, training
+from cluster.children import OUTPUT_FILE, THREADS, Child
 from shared.errors import UsageError, WorkerError
 
 STAND_IN = "learner_stand_in"
@@ -29,14 +27,16 @@ def learner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         textwrap.dedent(
             """
             import os, sys, time
-            print("step 1", flush=True)
-            if sys.argv[1] == "refuse":
-                print("setting 'steps': too few", file=sys.stderr); sys.exit(2)
-            if sys.argv[1] == "crash":
-                sys.exit(7)
-            if sys.argv[1] == "hang":
-                time.sleep(60)
-            print(os.environ["OMP_NUM_THREADS"])
+            from shared.errors import UsageError
+            def act(what):
+                print("step 1", flush=True)
+                if what == "refuse":
+                    raise UsageError("setting 'steps': too few")
+                if what == "crash":
+                    os._exit(7)
+                if what == "hang":
+                    time.sleep(60)
+                print(os.environ["OMP_NUM_THREADS"])
             """
         )
     )
@@ -44,30 +44,39 @@ def learner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+def act(what: str, out: Path, lines: list[str]) -> None:
+    with closing(Child(lines.append)) as child:
+        child.run(f"{STAND_IN}:act", {"what": what}, out)
+
+
 def test_its_lines_are_passed_on_and_kept(learner: Path, tmp_path: Path) -> None:
     lines: list[str] = []
-    children.run_child(STAND_IN, ["work"], tmp_path / "out", lines.append)
-    assert lines == ["step 1", str(children.THREADS)]
-    assert (tmp_path / "out" / children.OUTPUT_FILE).read_text().splitlines() == lines
+    act("work", tmp_path / "out", lines)
+    assert lines == ["step 1", str(THREADS)]
+    assert (tmp_path / "out" / OUTPUT_FILE).read_text().splitlines() == lines
 
 
 def test_what_it_refuses_is_refused_in_its_words(learner: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"^setting 'steps': too few$"):
-        children.run_child(STAND_IN, ["refuse"], tmp_path, lambda line: None)
+        act("refuse", tmp_path, [])
 
 
-def test_a_crash_names_its_output(learner: Path, tmp_path: Path) -> None:
-    with pytest.raises(WorkerError, match=r"ended with code 7; see .*output\.txt$"):
-        children.run_child(STAND_IN, ["crash"], tmp_path, lambda line: None)
+def test_a_crash_names_its_output_and_the_next_call_has_a_process_of_its_own(learner: Path, tmp_path: Path) -> None:
+    lines: list[str] = []
+    with closing(Child(lines.append)) as child:
+        with pytest.raises(WorkerError, match=r"ended with code 7; see .*output\.txt$"):
+            child.run(f"{STAND_IN}:act", {"what": "crash"}, tmp_path)
+        child.run(f"{STAND_IN}:act", {"what": "work"}, tmp_path)
+    assert lines == ["step 1", "step 1", str(THREADS)]
 
 
 def test_an_interrupt_ends_it(learner: Path, tmp_path: Path) -> None:
     def interrupt(line: str) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        children.run_child(STAND_IN, ["hang"], tmp_path, interrupt)
-    assert not [child for child in psutil.Process().children() if STAND_IN in " ".join(child.cmdline())]
+    with closing(Child(interrupt)) as child, pytest.raises(KeyboardInterrupt):
+        child.run(f"{STAND_IN}:act", {"what": "hang"}, tmp_path)
+    assert not [child for child in psutil.Process().children() if "cluster.children" in child.cmdline()]
 
 
 def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> None:
@@ -75,8 +84,8 @@ def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> 
         [
             sys.executable,
             "-uc",
-            "import pathlib; from cluster import children;"
-            f"children.run_child({STAND_IN!r}, ['hang'], pathlib.Path({str(tmp_path)!r}), print)",
+            "import pathlib; from cluster.children import Child;"
+            f"Child(print).run('{STAND_IN}:act', {{'what': 'hang'}}, pathlib.Path({str(tmp_path)!r}))",
         ],
         stdout=subprocess.PIPE,
     )
@@ -91,17 +100,3 @@ def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> 
     while children[0].is_running() and children[0].status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < deadline
         time.sleep(0.02)
-
-
-scalars = st.integers(-5, 5) | st.floats(allow_nan=False, allow_infinity=False) | st.booleans() | st.text('aé"\\\n ')
-settings = st.recursive(
-    scalars | st.lists(scalars, max_size=3),
-    lambda inner: st.dictionaries(st.sampled_from(["a", "b", "c"]), inner, max_size=3),
-    max_leaves=8,
-)
-
-
-@given(st.dictionaries(st.sampled_from(["a", "b", "c"]), settings))
-def test_settings_survive_toml(values: dict[str, object]) -> None:
-    assert tomllib.loads(training.as_toml(values)) == values
-    assert tomllib.loads(training.as_toml({**values, "none": None})) == values

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from cluster.training import as_toml
 from learner.configuration import AlternationConfig
 from shared.store import Store, verify
+from tests.as_toml import as_toml
 from tests.test_learner_training import FAST
 
 ROOT = Path(__file__).parents[1]

@@ -9,7 +9,7 @@ import pytest
 from adaafford.pretrained import load_policy
 from cluster.cli import run
 from cluster.curves import CSV_FILE, FIGURE_FILE, JSON_FILE, MARKDOWN_FILE
-from learner.alternation import alternate, trained_in
+from learner.alternation import Finished, alternate, trained_in
 from learner.configuration import AlternationConfig
 from learner.recipes import ORACLE_FILE
 from learner.stages import StageJob, objects_seen, run_stage
@@ -25,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("curve")
     plan = Plan(setting=fabricate_setting(objects=4, points=64))
     make_store(folder / "store", fabricated_rollouts(plan), plan)
-    objects = {"train_objects": {"object-0", "object-1"}, "validation_objects": {"object-2"}}
+    objects = {"train_objects": frozenset(("object-0", "object-1")), "validation_objects": frozenset(("object-2",))}
     privileged = FAST.model_copy(
         update={
             "aap": FAST.aap.model_copy(update={"training": "privileged"}),
@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         }
     )
     job = StageJob("prior", folder / "store", folder / "seed-1", **objects)
-    alternate(job, privileged)
+    alternate(Finished(job), privileged)
     paper = FAST.model_copy(update={"aap": FAST.aap.model_copy(update={"training": "paper"})})
     run_stage(StageJob("aap", folder / "store", folder / "paper", folder / "seed-1" / "prior", **objects), paper)
     return folder
@@ -70,11 +70,10 @@ def test_trainings_are_judged_between_where2act_and_the_oracle(
 
 def test_what_was_seen_is_written_down_from_stage_to_stage(folder: Path) -> None:
     found = trained_in(folder / "seed-1")
-    assert found.policy == folder / "seed-1" / "aip-1"
-    assert found.oracle == found.policy / ORACLE_FILE
-    assert found.oracle.read_bytes() == (folder / "seed-1" / "aap-1" / ORACLE_FILE).read_bytes()
+    assert found == folder / "seed-1" / "aip-1"
+    assert (found / ORACLE_FILE).read_bytes() == (folder / "seed-1" / "aap-1" / ORACLE_FILE).read_bytes()
     hashes = {ref.content_hash for ref in fabricate_setting(objects=3).objects}
-    assert objects_seen(found.policy) == objects_seen(folder / "paper") == hashes
+    assert objects_seen(found) == objects_seen(folder / "paper") == hashes
 
 
 @pytest.mark.parametrize(

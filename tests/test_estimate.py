@@ -4,31 +4,44 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from cluster.campaign import Campaign, Crew
+from cluster.campaign import steps_of
 from cluster.cli import run as adaafford
 from cluster.configuration import CampaignConfig, RolloutCounts
-from cluster.estimate import RATES, Estimate, StageCost, estimate, multiply_adds
-from cluster.run_folder import RunFolder
-from cluster.settings import layered, preset_names
+from cluster.estimate import RATES, Estimate, Rates, StageCost, estimate, multiply_adds
+from cluster.settings import layered
+from learner.alternation import Publish
 from shared.methods import METHODS
 from shared.networks.configuration import NETWORKS
 
-FREE = ("objects", "publish", "report")
+RATE_VALUES = {name: rate for name, rate in dataclasses.asdict(RATES).items() if name != "measured"}
 
 
 def stage(found: Estimate, name: str) -> StageCost:
     return next(each for each in found.stages if each.stage == name)
 
 
-@pytest.mark.parametrize("name", preset_names())
-def test_every_stage_of_a_preset_has_its_cost(name: str, tmp_path: Path) -> None:
-    config = layered(CampaignConfig, name, None)
-    crew = Crew(lambda *_: pytest.fail("a fleet was asked for"))
-    names = [each.name for each in Campaign(RunFolder(tmp_path), config).stages(crew)]
+@given(
+    alternations=st.integers(0, 3),
+    adopts=st.booleans(),
+    methods=st.sets(st.sampled_from(sorted(METHODS)), min_size=1).map(sorted),
+)
+@settings(deadline=None, max_examples=10)
+def test_what_a_campaign_does_is_what_is_paid_for(alternations: int, adopts: bool, methods: list[str]) -> None:
+    told = {"alternations": alternations + adopts, "start_from": "push-faucet" if adopts else None}
+    config = CampaignConfig.model_validate({**told, "evaluation": {"methods": methods}})
     found = estimate(config)
-    assert [each.stage for each in found.stages] == [name for name in names if not name.startswith(FREE)]
+    paid = {each.stage: each for each in found.stages}
+    steps = steps_of(config)
+    assert list(paid) == [step.name for step in steps if step.name in paid]
+    for step in steps:
+        free = step.name in ("objects", "adopt", "report") or isinstance(step, Publish)
+        assert free != (step.name in paid)
     assert all(each.core_s > 0 and each.size_bytes > 0 for each in found.stages)
+    doubled = estimate(config, Rates("twice", **{name: 2 * rate for name, rate in RATE_VALUES.items()}))
+    assert sum(each.core_s for each in doubled.stages) == pytest.approx(2 * sum(each.core_s for each in found.stages))
 
 
 def test_the_published_scale_is_the_published_one() -> None:

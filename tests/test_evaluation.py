@@ -18,6 +18,7 @@ from cluster.evaluation_of_run import evaluate_run
 from cluster.evaluation_settings import EvaluateSettings
 from cluster.evaluation_tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
 from cluster.judging import judge
+from cluster.session import Crew
 from collector.procedural.writing import generate
 from collector.worker import Worker
 from learner.bootstrap import ratio_interval
@@ -125,7 +126,7 @@ def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) 
     evaluation.add_plan(Plan(setting=evaluation.setting, proposer=PROPOSER, policy_version=7))
     wanted = Evaluation(evaluation, store, 1, 2, 1, finished / "objects", tmp_path, tmp_path)
     with pytest.raises(UsageError, match="trials of another policy"):
-        wanted.execute(lambda: pytest.fail("a fleet was asked for"), lambda: None, print)
+        wanted.execute(Crew(lambda *_: pytest.fail("a fleet was asked for")), print)
 
 
 def row_of(method: str, budget: int, f_score: float) -> EvaluationRow:

@@ -15,8 +15,8 @@ from packaging.utils import canonicalize_name
 
 import shared.extras as extras_module
 from cluster.cli import COMMANDS, NEEDS, run
-from cluster.training import as_toml
 from shared.extras import EXTRAS, extra_of
+from tests.as_toml import as_toml
 from tests.test_learner_data import make_store
 from tests.test_learner_training import FAST
 

@@ -9,18 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cluster.cli import run
-from cluster.locking import only_driver
-from cluster.training import as_toml
-from learner.alternation import alternate
+from learner.alternation import Collect, alternate
 from learner.configuration import PUBLISHED_FILE, AlternationConfig
 from learner.data import kept_for_validation, load_dataset, split
 from learner.following import Following, Pace, publish
 from learner.stages import DONE_FILE, StageJob
 from shared.errors import StoreError
+from shared.files import DRIVER_LOCK, exclusive_lock
 from shared.plan import Job, Plan
 from shared.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.store.snapshot import Snapshot
 from shared.store.store import Store
+from tests.as_toml import as_toml
 from tests.fabricate import fabricate_rollouts
 from tests.test_learner_data import fabricated_plan
 from tests.test_learner_training import FAST
@@ -52,7 +52,7 @@ def pass_some_time() -> None:
 
 
 def follow(where: str, out: Path) -> None:
-    alternate(StageJob("prior", where, out), CONFIG, rounds=Following(where, out, PACE))
+    alternate(Following(StageJob("prior", where, out), PACE), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -113,8 +113,9 @@ def test_enough_is_also_something_to_judge_by(tmp_path: Path) -> None:
         slept.append(seconds)
         commit(store, number, number + 1)
 
-    following = Following(store.where, tmp_path / "out", Pace(first=3, more=1), sleep)
-    job = following.data(StageJob("prior", store.where, tmp_path / "out"), 1)
+    following = Following(StageJob("prior", store.where, tmp_path / "out"), Pace(first=3, more=1), sleep)
+    following.collect(Collect("collect-random", 0))
+    job = following.job(1)
     assert len(slept) == 1
     assert job.snapshot is not None and job.snapshot.rollouts == 4
     assert job.validation_objects == {kept}
@@ -153,7 +154,7 @@ def test_the_command_learns_from_a_finished_store_in_a_bucket_and_publishes_the_
 
 def test_a_second_learner_in_the_same_folder_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
-    with only_driver(tmp_path / "out"):
+    with exclusive_lock(tmp_path / "out" / DRIVER_LOCK):
         assert run(["learn", "--store", str(tmp_path / "store"), "--out", str(tmp_path / "out"), "--follow"]) == 2
     assert "is in use by process" in capsys.readouterr().err
     (tmp_path / "file").write_text("")

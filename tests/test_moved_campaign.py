@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from cluster.configuration import CampaignConfig, LearnerSettings, RolloutCounts
-from cluster.training import as_toml
 from shared.interpreter import PYTHON, own_environment
 from shared.plan import EvaluationConfig
 from shared.store import Store, verify
+from tests.as_toml import as_toml
 from tests.test_learner_training import FAST
 
 pytestmark = pytest.mark.slow

@@ -16,7 +16,7 @@ from cluster.ledger import Ledger
 from cluster.logs import JsonLines, Lines, configure
 from cluster.progress import RECENT_S, CollectionProgress
 from cluster.standing import standing_of
-from cluster.status import SILENT_S, DriverStatus, StatusKeeper, read_status
+from cluster.status import SILENT_S, DriverStatus, read_status, status_kept
 from collector.receipt import Receipt
 from shared.errors import UsageError
 from shared.files import host_name, process_name
@@ -121,7 +121,7 @@ def test_the_keeper_writes_while_it_works_says_when_it_waits_and_how_it_ended(tm
     store = fill(str(tmp_path / "store"))
     said: list[str] = []
     waiting = False
-    keeper = StatusKeeper(store.place, lambda state: status_of(state), lambda: waiting, said.append, beat_s=0.01)
+    keeper = status_kept(store.place, lambda state: status_of(state), lambda: waiting, said.append, beat_s=0.01)
 
     def wait_for(state: str) -> None:
         deadline = time.monotonic() + 60
@@ -140,7 +140,7 @@ def test_the_keeper_writes_while_it_works_says_when_it_waits_and_how_it_ended(tm
 def test_a_status_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
     store = fill(str(tmp_path / "store"))
     (store.path / "status").write_text("a file in the place of the folder")
-    with StatusKeeper(store.place, lambda state: status_of(state), lambda: False, lambda line: None):
+    with status_kept(store.place, lambda state: status_of(state), lambda: False, lambda line: None):
         pass
 
 

@@ -16,17 +16,17 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import TypeAdapter
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from cluster.children import OUTPUT_FILE, Learner
+from cluster.children import OUTPUT_FILE, Child
 from cluster.cli import INTERRUPTED, run
-from cluster.training import as_toml
-from learner.alternation import ALTERNATION_FILE, alternate, converged
+from learner.alternation import ALTERNATION_FILE, Finished, alternate, converged
 from learner.configuration import METRICS_FILE, AlternationConfig, LearnerConfig
 from learner.data import load_dataset, split, without_later
 from learner.hardware import Hardware
-from learner.stages import DONE_FILE, LOCK_FILE, StageJob, read_policy_folder, run_stage
+from learner.stages import DONE_FILE, LOCK_FILE, StageJob, StageName, as_json, read_policy_folder, run_stage
 from learner.training import CHECKPOINT_FILE
 from shared.errors import UsageError, WorkerError
 from shared.files import exclusive_lock
@@ -34,7 +34,9 @@ from shared.plan import Job
 from shared.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.progress import Progress
 from shared.redaction import without_places
+from shared.store.snapshot import Snapshot
 from shared.store.store import Store
+from tests.as_toml import as_toml
 from tests.test_learner_data import fabricated_plan, fabricated_rollouts, make_store
 from tests.test_learner_training import FAST
 from tests.test_networks import TINY
@@ -98,26 +100,32 @@ def test_it_trains_without_ray_and_sapien(store: Path, config_file: Path, tmp_pa
     assert (tmp_path / "out" / WEIGHTS_FILE).is_file()
 
 
+def train_in(child: Child, job: StageJob) -> None:
+    child.run("learner.stages:run_from_json", as_json(job, EAGER), job.out)
+
+
 def learners() -> list[psutil.Process]:
     """This process's children that train; other tests may have left it others."""
     living = [child for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
-    return [child for child in living if "cluster.learning" in child.cmdline()]
+    return [child for child in living if "cluster.children" in child.cmdline()]
 
 
-def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, config_file: Path, tmp_path: Path) -> None:
-    def arguments(stage: str, *init: str) -> list[str]:
-        return [stage, "--store", str(store), "--out", str(tmp_path / stage), "--config", str(config_file), *init]
-
+def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, tmp_path: Path) -> None:
     lines: list[str] = []
-    with closing(Learner()) as learner:
-        learner.train(arguments("prior"), tmp_path / "prior", lines.append)
+
+    def train(stage: StageName, init: str | None = None) -> None:
+        job = StageJob(stage, store, tmp_path / stage, None if init is None else tmp_path / init)
+        train_in(child, job)
+
+    with closing(Child(lines.append)) as child:
+        train("prior")
         (one,) = learners()
-        learner.train(arguments("aap", "--init", str(tmp_path / "prior")), tmp_path / "aap", lines.append)
+        train("aap", "prior")
         assert learners() == [one], "the same process"
         with pytest.raises(UsageError, match="'aip' starts from a policy: add --init"):
-            learner.train(arguments("aip"), tmp_path / "aip", lines.append)
+            train("aip")
         assert not learners(), "ended by what failed"
-        learner.train(arguments("aip", "--init", str(tmp_path / "aap")), tmp_path / "aip", lines.append)
+        train("aip", "aap")
     assert not learners()
     assert read_policy_folder(tmp_path / "aip").trained == {"prior", "aap", "aip"}
     for stage in ("prior", "aap", "aip"):
@@ -126,24 +134,31 @@ def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, confi
         assert set(told.splitlines()) <= {without_places(line, tmp_path / stage) for line in lines}
 
 
-def test_a_learner_that_is_killed_ends_the_stage(store: Path, config_file: Path, tmp_path: Path) -> None:
-    told = ["prior", "--store", str(store), "--out", str(tmp_path), "--config", str(config_file)]
-
+def test_a_learner_that_is_killed_ends_the_stage(store: Path, tmp_path: Path) -> None:
     def kill(line: str) -> None:
         for child in learners():
             child.kill()
 
-    with (
-        closing(Learner()) as learner,
-        pytest.raises(WorkerError, match=r"`adaafford train prior .*` ended with code -9"),
-    ):
-        learner.train(told, tmp_path, kill)
+    with closing(Child(kill)) as child, pytest.raises(WorkerError, match=rf"{tmp_path} ended with code -9"):
+        train_in(child, StageJob("prior", store, tmp_path))
+
+
+def test_a_job_is_the_same_after_its_way_to_the_trainer(store: Path, tmp_path: Path) -> None:
+    snapshot = Snapshot(ranges={"random-v0": ((0, 3),)})
+    job = StageJob("aap", str(store), tmp_path, tmp_path / "prior", frozenset(("a b", "c")), None, snapshot, 2)
+    config = EAGER.model_copy(update={"seed": 2**62 + 1})
+    config = config.model_copy(
+        update={"prior": config.prior.model_copy(update={"seconds": 0.1, "learning_rate": 1e-17})}
+    )
+    sent = json.loads(json.dumps(as_json(job, config)))
+    assert TypeAdapter(StageJob).validate_python(sent["job"]) == job
+    assert LearnerConfig.model_validate(sent["config"]) == config
 
 
 def test_an_alternation_learns_round_by_round_and_goes_on_where_it_was_stopped(store: Path, tmp_path: Path) -> None:
     config = FAST.model_copy(update={"alternation": AlternationConfig(rounds=2)})
     job = StageJob("prior", store, tmp_path / "out")
-    alternate(job, config)
+    alternate(Finished(job), config)
     told = json.loads((job.out / ALTERNATION_FILE).read_text())
     assert [entry["round"] for entry in told["rounds"]] == [1, 2]
     assert told["best"] == min(told["rounds"], key=lambda entry: entry["score"])["round"]
@@ -152,7 +167,7 @@ def test_an_alternation_learns_round_by_round_and_goes_on_where_it_was_stopped(s
     shutil.rmtree(job.out / "aip-2")
     (job.out / "aap-2" / DONE_FILE).unlink()
     stamp = (job.out / "aip-1" / WEIGHTS_FILE).stat().st_mtime_ns
-    alternate(job, config)
+    alternate(Finished(job), config)
     assert {name: (job.out / name / WEIGHTS_FILE).read_bytes() for name in stages} == weights
     assert (job.out / "aip-1" / WEIGHTS_FILE).stat().st_mtime_ns == stamp
 

@@ -90,17 +90,18 @@ def _judge(command: CurveCommand, runs: dict[str, list[Path]]) -> "Curves":
     from learner.curve import Candidates
     from learner.data import load_dataset
     from learner.features import FrozenFeatures
+    from learner.recipes import ORACLE_FILE
     from learner.stages import objects_seen, read_policy_folder
     from shared.store.store import Store
 
     if command.threads is not None:
         torch.set_num_threads(command.threads)
     trained = {name: [trained_in(folder) for folder in folders] for name, folders in runs.items()}
-    policies = {name: [read_policy_folder(found.policy) for found in all_] for name, all_ in trained.items()}
+    policies = {name: [read_policy_folder(folder) for folder in all_] for name, all_ in trained.items()}
     store = Store.open(command.store)
     every = [policy for found in policies.values() for policy in found]
     _check(every, store.setting.task)
-    seen = frozenset().union(*(objects_seen(found.policy) for all_ in trained.values() for found in all_))
+    seen = frozenset().union(*(objects_seen(folder) for all_ in trained.values() for folder in all_))
     new = {ref.id for ref in store.setting.objects if ref.content_hash not in seen}
     dataset = load_dataset(store, every[0].config)
     rollouts = dataset.rollouts_of(new)
@@ -113,8 +114,8 @@ def _judge(command: CurveCommand, runs: dict[str, list[Path]]) -> "Curves":
     for name, found in trained.items():
         answers = []
         for place, (run, policy) in enumerate(zip(found, policies[name], strict=True)):
-            others = [all_[place].oracle for all_ in trained.values() if place < len(all_)]
-            oracle = next((path for path in [run.oracle, *others] if path is not None), None)
+            others = (all_[place] for all_ in trained.values() if place < len(all_))
+            oracle = next((path for each in (run, *others) if (path := each / ORACLE_FILE).is_file()), None)
             # Kept for one run alone, so that memory does not grow with their number.
             known = FrozenFeatures(dataset)
             answered, gained = _answers(known, candidates, policy, oracle, command.tries, gains=name not in gains)

@@ -44,8 +44,7 @@ def main(args: list[str]) -> int:
 
         check_baselines(command.settings.learner)
     if command.dry_run:
-        from cluster.estimate import RATES, estimate
-        from cluster.estimate_table import print_estimate
+        from cluster.estimate import RATES, estimate, print_estimate
 
         print_estimate(estimate(command.settings), command.settings.workers, RATES)
         return 0

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
 
@@ -12,9 +12,10 @@ from shared.errors import UsageError
 from shared.methods import BASELINES
 
 if TYPE_CHECKING:
-    from learner.stages import Memory
+    from learner.stages import StageJob, StageName
 
-STAGES = ("prior", "aap", "aip", *BASELINES.names(), "alternate")
+ALTERNATE = "alternate"
+STAGES = ("prior", "aap", "aip", *BASELINES.names(), ALTERNATE)
 USAGE = f"""usage: adaafford train {{{",".join(STAGES)}}} --store STORE --out RUN [--init RUN] [SETTINGS]
 
   prior      the Where2Act prior, from nothing
@@ -29,16 +30,14 @@ batch among N processes. `adaafford train prior --help` lists all settings."""
 
 
 @dataclass(frozen=True, slots=True)
-class TrainCommand:
-    """Train networks from a finished store. The same command again goes on where it was stopped."""
+class LearnerCommand:
+    """What all commands that train are told."""
 
     settings: Annotated[LearnerConfig, tyro.conf.arg(name="")]
     store: str
-    """Folder or s3:// URL of the store; it is only read."""
+    """Folder or s3:// URL of the store."""
     out: Path
-    """Folder for the policy, its metrics and checkpoints: new, or of the same training."""
-    init: Path | None = None
-    """The --out of the stage before, to start from."""
+    """Folder for policies, metrics and checkpoints: new, or of the same training."""
     train_objects: Path | None = None
     """A text file with the ids of the objects to learn from, one a line."""
     validation_objects: Path | None = None
@@ -46,42 +45,54 @@ class TrainCommand:
     config: Path | None = None
     """A TOML file of settings; flags are laid over it."""
 
+    def job(self, stage: "StageName" = "prior", init: Path | None = None) -> "StageJob":
+        """What is trained on."""
+        from learner.data import read_object_list
+        from learner.stages import StageJob
 
-def main(args: list[str], memory: "Memory | None" = None) -> int:
-    """Train; `memory` is of the stages that this process ran before."""
-    stage, rest = args[:1], args[1:]
-    if stage in ([], ["-h"], ["--help"]):
-        if stage:
-            print(USAGE)
-            return 0
-        raise UsageError(f"train needs one of {', '.join(STAGES)}; given nothing")
-    if stage[0] not in STAGES:
-        raise UsageError(f"train needs one of {', '.join(STAGES)}; given '{stage[0]}'")
-    early = early_flags(rest, "config")
-    config = Path(early["config"]) if early["config"] else None
-    defaults = TrainCommand(layered(LearnerConfig, None, config), tyro.MISSING, tyro.MISSING, config=config)
-    _train(stage[0], parse_flags(TrainCommand, rest, f"train {stage[0]}", defaults), memory)
-    return 0
+        train, validation = read_object_list(self.train_objects), read_object_list(self.validation_objects)
+        return StageJob(stage, self.store, self.out, init, train, validation)
 
 
-def _train(stage: str, command: TrainCommand, memory: "Memory | None") -> None:
-    from learner.alternation import alternate
-    from learner.data import read_object_list
+@dataclass(frozen=True, slots=True)
+class TrainCommand(LearnerCommand):
+    """Train networks from a finished store. The same command again goes on where it was stopped."""
+
+    init: Path | None = None
+    """The --out of the stage before, to start from."""
+
+
+Command = TypeVar("Command", bound=LearnerCommand)
+
+
+def parse_learner(command: type[Command], args: list[str], prog: str) -> Command:
+    """Parse the flags of a command that trains, laid over the file that --config names; raises as `parse_flags`."""
+    early = early_flags(args, "config")["config"]
+    config = Path(early) if early else None
+    defaults = command(layered(LearnerConfig, None, config), tyro.MISSING, tyro.MISSING, config=config)
+    return parse_flags(command, args, prog, defaults)
+
+
+def main(args: list[str]) -> int:
+    """Train."""
+    stage = args[0] if args else "nothing"
+    if stage in ("-h", "--help"):
+        print(USAGE)
+        return 0
+    if stage not in STAGES:
+        given = f"'{stage}'" if args else stage
+        raise UsageError(f"train needs one of {', '.join(STAGES)}; given {given}")
+    command = parse_learner(TrainCommand, args[1:], f"train {stage}")
+    from learner.alternation import Finished, alternate
     from learner.hardware import hardware
     from learner.recipes import check_baselines
-    from learner.stages import StageJob, run_stage
+    from learner.stages import run_stage
 
-    job = StageJob(
-        stage="prior" if stage == "alternate" else stage,
-        store=command.store,
-        out=command.out,
-        init=command.init,
-        train_objects=read_object_list(command.train_objects),
-        validation_objects=read_object_list(command.validation_objects),
-    )
     check_baselines(command.settings)
+    job = command.job("prior" if stage == ALTERNATE else stage, command.init)
     with hardware(command.settings) as used:
-        if stage == "alternate":
-            alternate(job, command.settings, used)
+        if stage == ALTERNATE:
+            alternate(Finished(job), command.settings, used)
         else:
-            run_stage(job, command.settings, used, memory)
+            run_stage(job, command.settings, used)
+    return 0

@@ -20,7 +20,7 @@ from obstore.store import S3Store
 from shared.errors import MissingError, StoreError, UnreadableError, UsageError
 from shared.redaction import without_secrets
 from shared.store.place import URL_SCHEME, Publication
-from shared.store.presence import Presence
+from shared.store.presence import present
 
 AT_ONCE = 16
 """Requests under way at the same time; each waits for the network most of its time."""
@@ -186,7 +186,7 @@ class BucketPlace:
 
     def only_one(self, name: str, *, alone: bool = False) -> AbstractContextManager[Any]:
         """See `Place.only_one`; several drivers do no harm here, they only do the same work twice."""
-        return Presence(self, name, alone=alone)
+        return present(self, name, alone=alone)
 
     def _map(self, act: Callable[[Any], Answer], items: Sequence[Any]) -> Iterator[Answer]:
         if self._pool is None:

@@ -7,17 +7,16 @@ after its own is written: of two that come at the same time, at least one sees t
 """
 
 import secrets
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from types import TracebackType
+from contextlib import contextmanager, suppress
 
 from pydantic import Field, ValidationError
 
 from shared.configuration import StrictModel
 from shared.errors import MissingError, StoreError, UsageError
 from shared.files import is_gone, process_name
+from shared.heartbeat import Heartbeat
 from shared.store.layout import STATUS_FOLDER
 from shared.store.place import Place
 from shared.underway import workers_at_work
@@ -45,77 +44,64 @@ class Mark(StrictModel):
         return not is_gone(self.process) and now - self.written < SILENT_S
 
 
-class Presence:
-    """A holder of a place without locks; use as a context.
+@contextmanager
+def present(place: Place, name: str, *, alone: bool) -> Iterator[None]:
+    """Hold a place without locks: leave a mark, look for others, and renew the mark as long as the context lasts.
 
     Args:
         place: where the mark lies.
         name: what is held.
         alone: whether there must be no other holder; without it, there may be others of this kind.
+
+    Raises:
+        UsageError: another holder must be alone, or this one must and there is another.
     """
+    own = f"{STATUS_FOLDER}/{name}-{process_name()}-{secrets.token_hex(4)}.json"
 
-    def __init__(self, place: Place, name: str, *, alone: bool) -> None:
-        self._place, self._name, self._alone = place, name, alone
-        self._key = f"{STATUS_FOLDER}/{name}-{process_name()}-{secrets.token_hex(4)}.json"
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._renew, name="presence", daemon=True)
+    def write() -> None:
+        mark = Mark(process=process_name(), alone=alone, written=time.time())
+        place.replace(own, mark.model_dump_json().encode())
 
-    def __enter__(self) -> "Presence":
-        """Leave the mark, and look for others.
+    def renew() -> None:
+        # The work itself meets whatever is wrong with the place.
+        with suppress(StoreError):
+            write()
 
-        Raises:
-            UsageError: another holder must be alone, or this one must and there is another.
-        """
-        self._write()
+    write()
+    try:
+        _refuse_others(place, name, own, alone=alone)
+    except BaseException:
+        place.remove(own)
+        raise
+    try:
+        with Heartbeat(renew, lambda _: BEAT_S, "presence"):
+            yield
+    finally:
+        # Where that fails it is silent from now on, which says the same some seconds later.
+        with suppress(StoreError):
+            place.remove(own)
+
+
+def _refuse_others(place: Place, name: str, own: str, *, alone: bool) -> None:
+    for key, mark in _others(place, name, own):
+        if not mark.is_alive(time.time()):
+            place.remove(key)
+        elif mark.alone or alone:
+            raise UsageError(
+                f"{place.where} is in use by process {mark.process}; wait for it or stop it "
+                f"(one that was killed is forgotten after {SILENT_S:.0f} s)"
+            )
+
+
+def _others(place: Place, name: str, own: str) -> Iterator[tuple[str, Mark]]:
+    for each in place.names(STATUS_FOLDER):
+        key = f"{STATUS_FOLDER}/{each}"
+        if not each.startswith(f"{name}-") or key == own:
+            continue
         try:
-            self._refuse_others()
-        except BaseException:
-            self._place.remove(self._key)
-            raise
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Remove the mark."""
-        self._stop.set()
-        self._thread.join()
-        try:
-            self._place.remove(self._key)
-        except StoreError:
-            return  # It is silent from now on, which says the same some seconds later.
-
-    def _write(self) -> None:
-        mark = Mark(process=process_name(), alone=self._alone, written=time.time())
-        self._place.replace(self._key, mark.model_dump_json().encode())
-
-    def _renew(self) -> None:
-        while not self._stop.wait(BEAT_S):
-            try:
-                self._write()
-            except StoreError:
-                continue  # The work itself meets whatever is wrong with the place.
-
-    def _refuse_others(self) -> None:
-        for key, mark in self._others():
-            if not mark.is_alive(time.time()):
-                self._place.remove(key)
-            elif mark.alone or self._alone:
-                raise UsageError(
-                    f"{self._place.where} is in use by process {mark.process}; wait for it or stop it "
-                    f"(one that was killed is forgotten after {SILENT_S:.0f} s)"
-                )
-
-    def _others(self) -> Iterator[tuple[str, Mark]]:
-        for name in self._place.names(STATUS_FOLDER):
-            key = f"{STATUS_FOLDER}/{name}"
-            if not name.startswith(f"{self._name}-") or key == self._key:
-                continue
-            try:
-                yield key, Mark.model_validate_json(self._place.read(key, _MAX_MARK_BYTES))
-            except (MissingError, ValidationError):
-                continue  # It has ended meanwhile, or it is no mark.
+            yield key, Mark.model_validate_json(place.read(key, _MAX_MARK_BYTES))
+        except (MissingError, ValidationError):
+            continue  # It has ended meanwhile, or it is no mark.
 
 
 @contextmanager

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from cluster.configuration import CampaignConfig
-from cluster.training import as_toml
 from learner.configuration import AlternationConfig
 from shared.policy import POLICY_FILE, WEIGHTS_FILE
+from tests.as_toml import as_toml
 from tests.chaos.counts import Counts
 from tests.chaos.killer import Campaign, Killer
 from tests.chaos.processes import Marked, Role

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from cluster.training import as_toml
 from learner.configuration import AlternationConfig
+from tests.as_toml import as_toml
 from tests.containers.engine import Engine, Services, engine, wait_for, why_not
 from tests.test_learner_training import FAST
 
