@@ -26,7 +26,7 @@ def stage(found: Estimate, name: str) -> StageCost:
 @given(
     alternations=st.integers(0, 3),
     adopts=st.booleans(),
-    methods=st.sets(st.sampled_from(sorted(METHODS)), min_size=1).map(sorted),
+    methods=st.sets(st.sampled_from(METHODS.names()), min_size=1).map(sorted),
 )
 @settings(deadline=None, max_examples=10)
 def test_what_a_campaign_does_is_what_is_paid_for(alternations: int, adopts: bool, methods: list[str]) -> None:

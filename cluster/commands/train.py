@@ -66,11 +66,20 @@ Command = TypeVar("Command", bound=LearnerCommand)
 
 
 def parse_learner(command: type[Command], args: list[str], prog: str) -> Command:
-    """Parse the flags of a command that trains, laid over the file that --config names; raises as `parse_flags`."""
+    """Parse the flags of a command that trains, laid over the file that --config names.
+
+    Raises:
+        UsageError: a setting is unknown or not allowed, also one of a package's baseline.
+    """
     early = early_flags(args, "config")["config"]
     config = Path(early) if early else None
     defaults = command(layered(LearnerConfig, None, config), tyro.MISSING, tyro.MISSING, config=config)
-    return parse_flags(command, args, prog, defaults)
+    parsed = parse_flags(command, args, prog, defaults)
+    if parsed.settings.baselines:
+        from learner.recipes import check_baselines
+
+        check_baselines(parsed.settings)
+    return parsed
 
 
 def main(args: list[str]) -> int:
@@ -85,10 +94,8 @@ def main(args: list[str]) -> int:
     command = parse_learner(TrainCommand, args[1:], f"train {stage}")
     from learner.alternation import Finished, alternate
     from learner.hardware import hardware
-    from learner.recipes import check_baselines
     from learner.stages import run_stage
 
-    check_baselines(command.settings)
     job = command.job("prior" if stage == ALTERNATE else stage, command.init)
     with hardware(command.settings) as used:
         if stage == ALTERNATE:
