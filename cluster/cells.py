@@ -1,7 +1,8 @@
-"""Figures as the tables for people show them; None and NaN are no figure, which is a dash."""
+"""Figures as tables show them (None and NaN as "-"), and as JSON can hold them."""
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 
 def percent(share: float | None, limits: Sequence[float | None] = (), decimals: int = 1) -> str:
@@ -24,3 +25,12 @@ def number(value: float | None) -> str:
     if value is None or math.isnan(value):
         return "-"
     return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def finite(value: Any) -> Any:
+    """A value of nested dicts and lists, in which every number that is not finite is None: JSON has no NaN."""
+    if isinstance(value, dict):
+        return {key: finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

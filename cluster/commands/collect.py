@@ -81,7 +81,7 @@ def main(args: list[str]) -> int:
         raise UsageError("the proposer 'aip' needs --policy VERSION (1 or more, or latest), and 'random' takes none")
     if command.settings.per_version is not None and command.policy != "latest":
         raise UsageError("--per-version is about the versions of --policy latest; without that, give --rollouts alone")
-    _collect(command)
+    run_collection(command)
     return 0
 
 
@@ -104,7 +104,8 @@ def _begun_with(where: str, found: "tuple[ObjectRef, ...]") -> "tuple[ObjectRef,
     return known
 
 
-def _collect(command: CollectCommand) -> None:
+def run_collection(command: CollectCommand) -> None:
+    """Collect what is left of a command that was checked."""
     from cluster.collection import Newest, collect
     from cluster.fleet import make_worker
     from cluster.objects import objects_for

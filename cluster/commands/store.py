@@ -2,7 +2,6 @@
 
 import faulthandler
 import json
-import math
 import sys
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from cluster.cells import finite
 from cluster.settings import parse_flags
 from shared.errors import UsageError
 from shared.plain import plain
@@ -134,7 +134,7 @@ def _info(command: InfoCommand) -> int:
             "objects": len(store.setting.objects),
             "policy_versions": store.policy_versions(),
         }
-        print(json.dumps(_finite(described), indent=2, allow_nan=False))
+        print(json.dumps(finite(described), indent=2, allow_nan=False))
         return 0
 
     def tallies(counts: dict[str, Tally]) -> str:
@@ -175,7 +175,7 @@ def _verify(command: VerifyCommand) -> int:
         divergence = _resimulated(store, command.objects, command)
         said["resimulated"] = _as_json(divergence)
     if command.json:
-        print(json.dumps(_finite(said), indent=2))
+        print(json.dumps(finite(said), indent=2))
         return 1 if problems else 0
     for problem in problems:
         print(plain(f"{problem.where}: {problem.what}"))
@@ -264,15 +264,6 @@ def _described(record: "RolloutRecord") -> str:
     outcomes = Counter(row.outcome.kind.value for row in record.interactions)
     counts = ", ".join(f"{name} {count}" for name, count in sorted(outcomes.items())) or "no interactions"
     return f"rollout {record.index} (object {record.object.id}): {record.status}; {counts}"
-
-
-def _finite(value: Any) -> Any:
-    """The value with null for what JSON cannot say (a rate of nothing)."""
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _check_place(command: CheckPlaceCommand) -> int:
