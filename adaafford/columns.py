@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.documents import printable
+from shared.plain import plain
 from shared.vocabulary import Float
 
 Columns = dict[str, NDArray[np.generic]]
@@ -45,7 +45,7 @@ def without_mark(data: bytes) -> bytes:
 
 def shown(names: Iterable[str]) -> str:
     """The first names that a file gave, short and without control characters."""
-    return " ".join(printable(name, 40) for name in islice(names, 12)) or "nothing"
+    return " ".join(plain(name, 40) for name in islice(names, 12)) or "nothing"
 
 
 def header_lines(data: bytes) -> Iterator[tuple[list[str], int]]:

@@ -15,13 +15,13 @@ import torch
 from pydantic import Field
 
 from benchmarks.script import main
-from cluster.benchmarks.progress import Advance, progress
 from cluster.commands.bench import StoredSettings, source_of, stored
 from shared.adaptation import Adapter
 from shared.errors import UsageError
 from shared.networks.configuration import NetworkConfig
 from shared.observation import round_points
 from shared.policy import Policy
+from shared.progress import Advance, Progress
 from shared.proposers import AipProposer
 from shared.store import Store
 from shared.vocabulary import Interaction, Observation, Outcome, OutcomeKind
@@ -46,8 +46,8 @@ def measure(command: AdaptSettings) -> dict[str, Any]:
     with stored(command) as store:
         policy = Policy.untrained(store.setting.task, NetworkConfig(), command.seed)
         benchmark = AdaptationBenchmark(store, policy, command.repeats)
-        with progress("rollouts of test-time steps", benchmark.turns) as advance:
-            benchmark.run(advance)
+        with Progress("rollouts of test-time steps", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
         result = benchmark.as_json() | source_of(command, store)
     print(f"{result['steps']} steps at each size, {result['threads']} threads; medians in ms")
     print(f"  {'points':>7}{'propose':>9}{'update':>9}{'step':>9}{'known observation':>20}")

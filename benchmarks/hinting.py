@@ -19,15 +19,15 @@ from pydantic import Field
 from adaafford import load_policy
 from benchmarks.script import check_picture, main
 from cluster.adoption import seen_by, unknown
-from cluster.benchmarks.progress import Advance, progress
-from cluster.cells import percent
 from cluster.commands.bench import StoredSettings, source_of, stored
 from cluster.picture import Panel, draw_panels
 from cluster.reporting.words import verdict
 from learner.bootstrap import ratio_interval
 from shared.adaptation import Adapter
 from shared.errors import UsageError
+from shared.formatting import percent
 from shared.policy import Policy
+from shared.progress import Advance, Progress
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
 from shared.vocabulary import Float, Float32, Interaction, Observation, Outcome
@@ -70,8 +70,8 @@ def measure(command: HintSettings) -> dict[str, Any]:
         print(f"--policy {unknown(command.policy)}", file=sys.stderr)
     with stored(command) as store:
         benchmark = HintBenchmark(store, policy, seen)
-        with progress("shards of hints", benchmark.turns) as advance:
-            benchmark.run(advance)
+        with Progress("shards of hints", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
         result = benchmark.as_json() | source_of(command, store) | {"policy": command.policy}
     print("affordance of a door's free and hinge side before and after one random try, and in how many it rose")
     for case, figures in result["cases"].items():

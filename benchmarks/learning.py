@@ -17,12 +17,12 @@ from torch import Tensor
 from benchmarks.script import main
 from benchmarks.straightforward import POINTS, PublishedStep
 from cluster.benchmarks.learning import NETWORKS, stages_of, training_rate
-from cluster.benchmarks.progress import progress
 from cluster.commands.bench import StoredSettings, source_of, stored
 from learner.configuration import LearnerConfig
 from learner.data import Dataset, load_dataset, split
 from learner.hardware import Hardware
 from learner.training import Stage
+from shared.progress import Progress
 from shared.seeds import generator
 
 PARTS = ("read", "sample", "encode", "heads", "optimiser")
@@ -49,7 +49,7 @@ def measure(command: LearningSettings) -> dict[str, Any]:
         dataset = load_dataset(store, config.network)
         read_s = time.perf_counter() - begun
         stages, port = stages_of(dataset, split(dataset, None, None), config), Port(dataset, command.port_interactions)
-        with progress("turns of training, and of the published step", command.repeats + 1) as advance:
+        with Progress("turns of training, and of the published step", command.repeats + 1) as progress:
             for turn in range(command.repeats + 1):
                 for name, stage, settings in stages:
                     rate = training_rate(stage, settings, command.steps, config.seed, Hardware())
@@ -61,7 +61,7 @@ def measure(command: LearningSettings) -> dict[str, Any]:
                             parts[name][part].append(value)
                 if turn:
                     rates["port"].append(port.rate())
-                advance()
+                progress.advance()
         rate_of = {name: median(each) for name, each in rates.items()}
         step = {name: {part: median(each) for part, each in found.items()} for name, found in parts.items()}
         result = {f"{name.replace('-', '_')}_interactions_per_second": rate_of[name] for name in NETWORKS} | {

@@ -13,8 +13,8 @@ from typing import Any
 
 import psutil
 
-from cluster.benchmarks.progress import Advance
 from shared.plan import Job, missing_ranges
+from shared.progress import Advance
 from shared.records import RolloutRecord
 from shared.store import Store
 from shared.store.layout import MANIFEST_FILE

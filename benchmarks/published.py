@@ -15,11 +15,11 @@ from benchmarks import published_trial
 from benchmarks.published_trial import PublishedRequest, PublishedTiming
 from benchmarks.script import main
 from cluster.benchmarks.collecting import collect, jobs_of, summary
-from cluster.benchmarks.progress import progress
 from cluster.commands.bench import BenchSettings, planned, print_collection
 from collector.partnet import urdf_of
 from shared.errors import WorkerError
 from shared.interpreter import PYTHON, own_environment
+from shared.progress import Progress
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
 
@@ -51,14 +51,14 @@ def measure(command: PublishedSettings) -> dict[str, Any]:
     """Measure, turn by turn, and print both."""
     runs, published = [], list[PublishedRun]()
     total = command.repeats * jobs_of(command.rollouts) + command.sample
-    with planned(command) as (plan, folder), progress(f"jobs and published trials, {command.task}", total) as advance:
+    with planned(command) as (plan, folder), Progress(f"jobs and published trials, {command.task}", total) as progress:
         for turn in range(command.repeats):
             with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
                 store = Store.create(Path(scratch) / "store", plan.setting)
-                runs.append(collect(plan, folder, command.rollouts, store, advance))
+                runs.append(collect(plan, folder, command.rollouts, store, progress.advance))
                 for rollout, row in islice(_sample(store, command.sample), turn, None, command.repeats):
                     published.append(_execute(folder, rollout, row))
-                    advance()
+                    progress.advance()
     result = summary(runs)
     core_s, published_s = 1 / result["interactions_per_core_second"], mean(run.cpu_s for run in published)
     short_s = mean(run.cpu_s - run.timing.settle + run.timing.settle_short for run in published)

@@ -24,7 +24,6 @@ from pydantic import Field
 from benchmarks.listing import ListingBenchmark, StorePoint
 from benchmarks.script import check_picture, main
 from benchmarks.sleeping import Dormitories, Sleeper
-from cluster.benchmarks.progress import Advance, progress
 from cluster.commands.bench import StoredSettings, source_of, stored
 from cluster.orders import Series
 from cluster.progress import CollectionProgress
@@ -34,6 +33,7 @@ from collector.guard import Limits
 from collector.receipt import Receipt
 from shared.errors import UsageError
 from shared.plan import Plan
+from shared.progress import Advance, Progress
 from shared.underway import Underway
 
 BEDS = 100
@@ -83,11 +83,11 @@ def measure(command: ScaleSettings) -> dict[str, Any]:
         result: dict[str, Any] = source_of(command, source)
         sizes = command.actors, command.processes
         fleets = FleetBenchmark(source.plans()[0], *sizes, command.shards_per_s, command.seconds)
-        with progress("fleets of sleeping actors", fleets.turns) as advance:
-            fleets.run(advance)
+        with Progress("fleets of sleeping actors", fleets.turns) as progress:
+            fleets.run(progress.advance)
         listing = ListingBenchmark(source, Path(scratch) / "large", command.shards)
-        with progress("stores of made-up shards", listing.turns) as advance:
-            listing.run(advance)
+        with Progress("stores of made-up shards", listing.turns) as progress:
+            listing.run(progress.advance)
         rollout = source.setting.collection.rollout.interactions
     result |= {"fleets": [asdict(point) for point in fleets.points]}
     result |= {"stores": [asdict(point) for point in listing.points]}

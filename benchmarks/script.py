@@ -3,19 +3,26 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from cluster.cli import begin_process, guarded
-from cluster.commands.bench import Settings, run_benchmark
+from cluster.commands.bench import BenchSettings, flags_of, run_benchmark
+from cluster.settings import parse_flags
 from shared.errors import UsageError
 
+Settings = TypeVar("Settings", bound=BenchSettings)
 Measure = Callable[[Settings], dict[str, Any]]
 
 
 def run_script(name: str, settings: type[Settings], measure: Measure[Settings], args: list[str]) -> int:
     """Run a benchmark as `adaafford bench` runs its own; returns the exit code."""
-    program = "python -m benchmarks."
-    return guarded(lambda: run_benchmark(name, settings, measure, args, program), [name, *args])
+
+    def run() -> int:
+        return run_benchmark(
+            name, measure, parse_flags(flags_of(settings), args, name, program="python -m benchmarks.")
+        )
+
+    return guarded(run, [name, *args])
 
 
 def main(name: str, settings: type[Settings], measure: Measure[Settings]) -> NoReturn:

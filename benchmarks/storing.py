@@ -16,10 +16,10 @@ from pydantic import Field
 
 from benchmarks.s3_server import loopback_bucket
 from benchmarks.script import main
-from cluster.benchmarks.progress import Advance, progress
 from cluster.commands.bench import StoredSettings, source_of, stored
 from shared.errors import StoreError
 from shared.plan import Job
+from shared.progress import Advance, Progress
 from shared.records import RolloutRecord
 from shared.store import Store, info
 from shared.store.layout import MAX_DOCUMENT_BYTES, SHARDS_FOLDER
@@ -40,8 +40,8 @@ def measure(command: StoreSettings) -> dict[str, Any]:
     """Measure, and print a table."""
     with stored(command) as source:
         benchmark = StoringBenchmark(source, command.repeats, command.bucket)
-        with progress("turns of writing and reading", benchmark.turns) as advance:
-            benchmark.run(advance)
+        with Progress("turns of writing and reading", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
         result = benchmark.as_json() | source_of(command, source)
     print(f"{result['interactions']} interactions in {result['shards']} shards, {command.repeats} times; medians")
     print(f"  bytes an interaction  {result['bytes_per_interaction']:.0f}")

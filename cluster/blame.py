@@ -16,8 +16,9 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cluster.orders import Order, Orders
+from cluster.orders import Orders, PlannedJob
 from shared.errors import WorkerError
+from shared.plain import plain
 from shared.plan import Job
 from shared.redaction import without_secrets
 
@@ -204,8 +205,8 @@ class Backlog:
     def __init__(self, orders: Orders, blame: Blame) -> None:
         self._orders = orders
         self._blame = blame
-        self._again: deque[Order] = deque()
-        self._suspended: deque[Order] = deque()
+        self._again: deque[PlannedJob] = deque()
+        self._suspended: deque[PlannedJob] = deque()
 
     def __len__(self) -> int:
         """How many are to be handed out at once."""
@@ -216,16 +217,16 @@ class Backlog:
         """Whether there will be no more, unless one that is handed out comes back."""
         return not self._again and not self._suspended and self._orders.ended
 
-    def append(self, order: Order) -> None:
+    def append(self, order: PlannedJob) -> None:
         """Add an order to those that are to be handed out at once."""
         self._again.append(order)
 
-    def put_back(self, orders: Sequence[Order]) -> None:
+    def put_back(self, orders: Sequence[PlannedJob]) -> None:
         """Take back orders that failed, in front of the others."""
         for order in reversed(orders):
             (self._suspended if self._blame.is_suspended(order.job) else self._again).appendleft(order)
 
-    def take(self, *, idle: bool) -> Order | None:
+    def take(self, *, idle: bool) -> PlannedJob | None:
         """The next one; None where there is none, or none yet.
 
         Args:
@@ -236,7 +237,7 @@ class Backlog:
         """
         return self._again.popleft() if self._again else self.take_new(idle=idle)
 
-    def take_new(self, *, idle: bool) -> Order | None:
+    def take_new(self, *, idle: bool) -> PlannedJob | None:
         """The next one behind those that are to be handed out at once; see `take`."""
         if self._suspended and not self._blame.is_suspended(self._suspended[0].job):
             return self._suspended.popleft()
@@ -249,6 +250,5 @@ class Backlog:
 
 def describe(error: BaseException) -> str:
     """An exception in one line of bounded length."""
-    said = without_secrets(" ".join(str(error).split()))
-    text = "".join(letter for letter in said if letter.isprintable())[:300]
+    text = plain(without_secrets(" ".join(str(error).split())), 300)
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

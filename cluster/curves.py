@@ -10,12 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from cluster.cells import percent
-from cluster.evaluation_tables import as_csv
 from learner.comparison import CurveRow
 from learner.curve import ProposalGain
-from learner.training import without_nan
 from shared.files import make_folder, write_atomically
+from shared.formatting import csv_table, finite, markdown_table, percent
 from shared.plain import markdown
 
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, FIGURE_FILE = "curve.json", "curve.csv", "curve.md", "curve.png"
@@ -26,6 +24,15 @@ CRITICS = {
     "information": "AAP, tries by expected information",
     "oracle": "oracle, told the hidden facts",
 }
+COLUMNS = ("training", "critic", "tries", "F-score", "gap closed", "best F", "BCE", "AUC", "ECE", "from no tries")
+GAIN_COLUMNS = (
+    "tries",
+    "by a random one",
+    "by AIP's choice",
+    "by the best, in hindsight",
+    "loss before",
+    "correlation",
+)
 _STYLES = {"random": ("tab:blue", "o"), "aip": ("tab:orange", "s"), "information": ("tab:green", "^")}
 _LINES = ("-", "--", ":", "-.")
 
@@ -56,8 +63,7 @@ class Curves:
 def write_curves(out: Path, curves: Curves) -> None:
     """Write the four files; curve.json comes last. Raises as `make_folder` does."""
     make_folder(out)
-    rows = [without_nan(asdict(row)) for row in curves.rows]
-    write_atomically(out / CSV_FILE, as_csv(rows).encode())
+    write_atomically(out / CSV_FILE, csv_table(as_json(curves)["rows"]).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(curves).encode())
     draw_curves(curves, out / FIGURE_FILE)
     write_atomically(out / JSON_FILE, json.dumps(as_json(curves), indent=1, allow_nan=False).encode())
@@ -65,9 +71,7 @@ def write_curves(out: Path, curves: Curves) -> None:
 
 def as_json(curves: Curves) -> dict[str, Any]:
     """All of it as JSON has it; null for no figure."""
-    found = asdict(curves)
-    found["rows"] = [without_nan(row) for row in found["rows"]]
-    found["gains"] = {name: [without_nan(asdict(gain)) for gain in gains] for name, gains in curves.gains.items()}
+    found: dict[str, Any] = finite(asdict(curves))
     return found
 
 
@@ -85,23 +89,8 @@ def as_markdown(curves: Curves) -> str:
         "tries and the oracle. In brackets: 95% bootstrap intervals over objects, all seeds together. Digest of the "
         f"interactions: `{curves.digest[:16]}`.",
         "",
-        "| training | critic | tries | F-score | gap closed | best F | BCE | AUC | ECE | from no tries |",
-        "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+        *markdown_table(COLUMNS, map(_cells, pooled), left=2),
     ]
-    for row in pooled:
-        cells = [
-            markdown(row.name),
-            CRITICS[row.critic],
-            str(row.tries),
-            percent(row.f_score, (row.f_score_low, row.f_score_high)),
-            percent(row.closed, (row.closed_low, row.closed_high)),
-            percent(row.best_f_score),
-            f"{row.bce:.4f}",
-            f"{row.auc:.3f}",
-            f"{row.calibration_error:.3f}",
-            percent(row.closed_from_none),
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
     lines += ["", "By run (F-score / gap closed):", "", *_by_run(curves.rows)]
     for name, gains in curves.gains.items():
         lines += [
@@ -109,15 +98,29 @@ def as_markdown(curves: Curves) -> str:
             f"Drop of the loss on the questions by the next try, in thousandths of a nat ({markdown(name)}, its first "
             "run):",
             "",
-            "| tries | by a random one | by AIP's choice | by the best, in hindsight | loss before | correlation |",
-            "| ---: | ---: | ---: | ---: | ---: | ---: |",
-        ]
-        lines += [
-            f"| {g.before} | {1e3 * g.random:.1f} | {1e3 * g.aip:.1f} | {1e3 * g.greedy:.1f} | {1e3 * g.loss:.0f} | "
-            f"{g.correlation:.2f} |"
-            for g in gains
+            *markdown_table(GAIN_COLUMNS, map(_gain_cells, gains), left=0),
         ]
     return "\n".join(lines) + "\n"
+
+
+def _cells(row: CurveRow) -> list[str]:
+    return [
+        markdown(row.name),
+        CRITICS[row.critic],
+        str(row.tries),
+        percent(row.f_score, (row.f_score_low, row.f_score_high)),
+        percent(row.closed, (row.closed_low, row.closed_high)),
+        percent(row.best_f_score),
+        f"{row.bce:.4f}",
+        f"{row.auc:.3f}",
+        f"{row.calibration_error:.3f}",
+        percent(row.closed_from_none),
+    ]
+
+
+def _gain_cells(gain: ProposalGain) -> list[str]:
+    drops = [f"{1e3 * drop:.1f}" for drop in (gain.random, gain.aip, gain.greedy)]
+    return [str(gain.before), *drops, f"{1e3 * gain.loss:.0f}", f"{gain.correlation:.2f}"]
 
 
 def _by_run(rows: Sequence[CurveRow]) -> list[str]:
@@ -125,17 +128,14 @@ def _by_run(rows: Sequence[CurveRow]) -> list[str]:
     asked = list(dict.fromkeys((row.critic, row.tries) for row in rows))
     runs = list(dict.fromkeys((row.name, row.run) for row in rows if row.run))
     found = {(row.name, row.run, row.critic, row.tries): row for row in rows}
-    lines = [
-        "| training | run | " + " | ".join(f"{critic} {tries}" for critic, tries in asked) + " |",
-        "| --- | --- |" + " ---: |" * len(asked),
-    ]
+    table = []
     for name, run in runs:
-        cells = []
+        cells = [markdown(name), markdown(run)]
         for critic, tries in asked:
             row = found.get((name, run, critic, tries))
             cells.append("-" if row is None else f"{percent(row.f_score)} / {percent(row.closed)}")
-        lines.append(f"| {markdown(name)} | {markdown(run)} | " + " | ".join(cells) + " |")
-    return lines
+        table.append(cells)
+    return markdown_table(("training", "run", *(f"{critic} {tries}" for critic, tries in asked)), table, left=2)
 
 
 def draw_curves(curves: Curves, path: Path) -> None:

@@ -3,30 +3,30 @@
 import sys
 
 from rich.console import Console
-from rich.table import Table
 
 from cluster.children import THREADS
 from cluster.estimate import Estimate, Rates
+from shared.formatting import terminal_table
 
 
 def print_estimate(estimate: Estimate, workers: int, rates: Rates) -> None:
     """Print the cost of each stage, and of all."""
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
     train, validation, test = estimate.objects
-    table = Table(title=f"{estimate.task}: {train} objects to train on, {validation} to validate, {test} to test")
-    for name in ("stage", "interactions", "core-hours", "wall hours", "disk"):
-        table.add_column(name, justify="left" if name == "stage" else "right")
-    wall_s = 0.0
+    rows, wall_s = [], 0.0
     for stage in estimate.stages:
         # Trials are shared by the workers; a network is trained by one process.
         stage_s = stage.core_s / (max(workers, 1) if stage.interactions else THREADS)
         wall_s += stage_s
         shown = f"{stage.interactions:,}" if stage.interactions else "-"
-        table.add_row(stage.stage, shown, _hours(stage.core_s), _hours(stage_s), _size(stage.size_bytes))
+        rows.append((stage.stage, shown, _hours(stage.core_s), _hours(stage_s), _size(stage.size_bytes)))
     interactions = sum(stage.interactions for stage in estimate.stages)
     core_s = sum(stage.core_s for stage in estimate.stages)
     total = sum(stage.size_bytes for stage in estimate.stages)
-    table.add_row("in all", f"{interactions:,}", _hours(core_s), _hours(wall_s), _size(total), style="bold")
+    rows.append(("in all", f"{interactions:,}", _hours(core_s), _hours(wall_s), _size(total)))
+    title = f"{estimate.task}: {train} objects to train on, {validation} to validate, {test} to test"
+    table = terminal_table(title, ("stage", "interactions", "core-hours", "wall hours", "disk"), rows)
+    table.rows[-1].style = "bold"
     console.print(table)
     console.print(
         f"wall hours    with {max(workers, 1)} workers for trials and {THREADS} threads for training\n"

@@ -4,20 +4,20 @@ They hold nothing of when, where and by how many workers they were made, so that
 again leaves the same bytes.
 """
 
-import csv
-import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cluster.cells import percent
+from pydantic import BaseModel, ConfigDict, Field
+
 from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
 from shared.files import write_atomically
+from shared.formatting import csv_table, markdown_table, percent
 from shared.methods import METHODS, MethodName
-from shared.plain import csv_cell, markdown
+from shared.plain import markdown
 
 RESULTS_FILE, CSV_FILE, MARKDOWN_FILE = "results.json", "table.csv", "table.md"
 
@@ -48,8 +48,54 @@ ORDER = (*METHODS, NO_TRIES_METHOD, ORACLE_METHOD)
 """Of rows: as in the paper's tables, and then what stands beside them."""
 
 
+class ResultRow(BaseModel):
+    """A row of results.json: a method after a budget. See `learner.evaluation.EvaluationRow`."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    method: str = Field(max_length=100)
+    budget: int
+    f_score: float | None
+    f_score_low: float | None = None
+    f_score_high: float | None = None
+    sample_success: float | None
+    sample_success_low: float | None = None
+    sample_success_high: float | None = None
+    start_success: float | None = None
+    start_success_low: float | None = None
+    start_success_high: float | None = None
+    trials: int
+    gap_closed: float | None = None
+    best_f: float | None
+    bce: float | None
+    auc: float | None
+    base_rate: float | None
+    queries: int
+    mean_tries: float | None
+
+    def value(self, measure: Measure) -> float | None:
+        """One of the measures."""
+        found: float | None = getattr(self, measure)
+        return found
+
+    def interval(self, measure: Measure) -> tuple[float, float] | None:
+        """The limits of its 95% interval; None where it has none."""
+        low, high = (getattr(self, f"{measure}_{end}") for end in ("low", "high"))
+        return None if low is None or high is None else (low, high)
+
+
+class ResultRows(BaseModel):
+    """What is read of results.json."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    task: str = Field("", max_length=100)
+    objects: int = Field(ge=0)
+    rows: tuple[ResultRow, ...]
+
+
 @dataclass(frozen=True, slots=True)
-class Table:
+class EvaluationTable:
     """What came of an evaluation.
 
     Attributes:
@@ -79,24 +125,15 @@ def share_of_gap(low: float, value: float, high: float) -> float:
     return (value - low) / (high - low) if high > low else math.nan
 
 
-def write_tables(out: Path, table: Table) -> None:
+def write_tables(out: Path, table: EvaluationTable) -> None:
     """Write the three files; results.json comes last, so that where it is, all are."""
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / CSV_FILE, as_csv(table.rows).encode())
+    write_atomically(out / CSV_FILE, csv_table(table.rows, _ONLY_FOR_PROGRAMS).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(table).encode())
     write_atomically(out / RESULTS_FILE, json.dumps(asdict(table), allow_nan=False).encode())
 
 
-def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """A line for each row, full precision; empty where there is no figure."""
-    text, names = io.StringIO(), [name for name in (rows[0] if rows else ()) if name not in _ONLY_FOR_PROGRAMS]
-    writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: csv_cell(row[name]) for name in names} for row in rows)
-    return text.getvalue()
-
-
-def as_markdown(table: Table) -> str:
+def as_markdown(table: EvaluationTable) -> str:
     """The table as the paper has it, with 95% intervals; percent where the paper has percent."""
     base_rate = next((row["base_rate"] for row in table.rows), None)
     shown = "none" if base_rate is None else f"{100 * base_rate:.1f}%"
@@ -109,10 +146,8 @@ def as_markdown(table: Table) -> str:
         "where they began. Gap closed: of that in F-score between Where2Act and the oracle, which is told the hidden "
         f"facts. Digest of the interactions: `{table.store_digest[:16]}`.",
         "",
-        "| " + " | ".join(_SHOWN.values()) + " |",
-        "| --- |" + " ---: |" * (len(_SHOWN) - 1),
+        *markdown_table(list(_SHOWN.values()), ([_cell(row, name) for name in _SHOWN] for row in table.rows)),
     ]
-    lines += ["| " + " | ".join(_cell(row, name) for name in _SHOWN) + " |" for row in table.rows]
     return "\n".join(lines) + "\n"
 
 

@@ -12,16 +12,12 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from cluster.blame import Backlog, Blame, Failure
-from cluster.orders import Order, Orders
-from collector.guard import UnderWay
+from cluster.orders import Orders, PlannedJob
+from collector.receipt import JobWorker, Receipt, WorkerFactory
 from shared.errors import AdaAffordError
-from shared.plan import Job, Plan
-
-if TYPE_CHECKING:
-    from collector.receipt import Receipt
 
 WAIT_S = 0.5
 """How often a fleet that has nothing to do asks for orders."""
@@ -29,30 +25,14 @@ WAIT_S = 0.5
 logger = logging.getLogger(__name__)
 
 
-class Worker(Protocol):
-    """What a fleet needs of `collector.worker.Worker`."""
-
-    def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
-        """Make the policy `version` ready for plans that use it."""
-        ...
-
-    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> "Receipt":
-        """Execute and commit `job`; do nothing if that was done before. See `collector.worker.Worker.run`."""
-        ...
-
-
-WorkerFactory = Callable[[], Worker]
-"""Makes a worker in the process that will use it; must be picklable for a fleet of processes."""
-
-
-def make_worker(store: str | Path, objects: Path) -> Worker:
+def make_worker(store: str | Path, objects: Path) -> JobWorker:
     """Make a `collector.worker.Worker` in the process that calls; `partial` of this is a `WorkerFactory`.
 
     The engine is imported here and not by the driver, which needs none where Ray's actors do the work.
     """
-    from collector.worker import Worker as Collector
+    from collector.worker import Worker
 
-    return Collector(store, objects)
+    return Worker(store, objects)
 
 
 class Fleet(Protocol):
@@ -67,7 +47,7 @@ class Fleet(Protocol):
         """Hand the weights of policy `version` to every worker, present and future."""
         ...
 
-    def run(self, orders: Orders, on_receipt: Callable[["Receipt"], None]) -> None:
+    def run(self, orders: Orders, on_receipt: Callable[[Receipt], None]) -> None:
         """Execute `orders` until they have ended, in any order, and report each once.
 
         They are taken no earlier than somebody is free for them, and asked for again where there is none yet. A rollout
@@ -96,7 +76,7 @@ class SerialFleet:
     def __init__(self, make_worker: WorkerFactory) -> None:
         self.restarts = 0
         self._make_worker = make_worker
-        self._worker: Worker | None = None
+        self._worker: JobWorker | None = None
         self._policies: dict[int, Mapping[str, bytes]] = {}
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
@@ -105,7 +85,7 @@ class SerialFleet:
         if self._worker is not None:
             self._worker.load_policy(version, files)
 
-    def run(self, orders: Orders, on_receipt: Callable[["Receipt"], None]) -> None:
+    def run(self, orders: Orders, on_receipt: Callable[[Receipt], None]) -> None:
         """See `Fleet.run`."""
         blame = Blame()
         backlog = Backlog(orders, blame)
@@ -122,7 +102,7 @@ class SerialFleet:
         """See `Fleet.close`."""
         self._worker = None
 
-    def _run(self, order: Order, blame: Blame) -> "Receipt | None":
+    def _run(self, order: PlannedJob, blame: Blame) -> Receipt | None:
         """Try a job; None if it failed, which takes a fresh worker the next time."""
         job = order.job
         rollouts: list[int | None] = [None]
@@ -139,7 +119,7 @@ class SerialFleet:
         blame.acquit(job)
         return receipt
 
-    def _live_worker(self) -> Worker:
+    def _live_worker(self) -> JobWorker:
         """The worker, made and given all policies if there is none yet."""
         if self._worker is None:
             self._worker = self._make_worker()

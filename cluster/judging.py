@@ -10,11 +10,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from cluster.evaluation_tables import Table, share_of_gap, write_tables
+from cluster.evaluation_tables import EvaluationTable, share_of_gap, write_tables
 from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD, EvaluationRow, evaluate_store
 from learner.oracle import read_oracle
 from learner.recipes import ORACLE_FILE
 from shared.errors import AdaAffordError
+from shared.formatting import finite
 from shared.policy import Policy
 from shared.store import Store
 
@@ -30,7 +31,7 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def judge(store: Store, version: int, oracle: Path) -> Table:
+def judge(store: Store, version: int, oracle: Path) -> EvaluationTable:
     """The table, a row for each method and budget.
 
     Args:
@@ -48,7 +49,7 @@ def judge(store: Store, version: int, oracle: Path) -> Table:
         # The prior knows nothing of tries: all its actions count at every budget, to stand beside the others.
         rows += [replace(row, budget=budget) for budget in budgets] if row.method == PRIOR_METHOD else [row]
     tried = {name for row in rows for name in row.counts.object}
-    return Table(
+    return EvaluationTable(
         task=store.setting.task,
         seed=store.setting.seed,
         objects=len(tried),
@@ -56,7 +57,7 @@ def judge(store: Store, version: int, oracle: Path) -> Table:
         policy_version=version,
         store_digest=store.digest(),
         contents={ref.id: ref.content_hash for ref in store.setting.objects if ref.id in tried},
-        rows=tuple(_plain(row) | {"gap_closed": _finite(_gap_closed(row, rows))} for row in rows),
+        rows=tuple(finite(_values(row) | {"gap_closed": _gap_closed(row, rows)}) for row in rows),
     )
 
 
@@ -66,14 +67,8 @@ def _gap_closed(row: EvaluationRow, rows: list[EvaluationRow]) -> float:
     return share_of_gap(prior, row.f_score, oracle)
 
 
-def _plain(row: EvaluationRow) -> dict[str, Any]:
-    """For JSON, which has no NaN; there it is null."""
-    values = {"best_f" if name == "best_f_score" else name: value for name, value in asdict(row).items()}
-    return {name: _finite(value) if isinstance(value, float) else value for name, value in values.items()}
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _values(row: EvaluationRow) -> dict[str, Any]:
+    return {"best_f" if name == "best_f_score" else name: value for name, value in asdict(row).items()}
 
 
 if __name__ == "__main__":

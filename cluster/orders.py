@@ -21,7 +21,7 @@ NOTHING: Mapping[str, int] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class PlannedJob:
     """A job and its plan. A job that failed is tried again under the plan that it was handed out with."""
 
     plan: Plan
@@ -41,26 +41,9 @@ class Orders(Protocol):
         """Whether some of what they are part of was done before."""
         ...
 
-    def take(self) -> Order | None:
+    def take(self) -> PlannedJob | None:
         """The next one; None where there is none, or none yet: `ended` tells which."""
         ...
-
-
-class Listed:
-    """Jobs of one plan that are known beforehand."""
-
-    def __init__(self, plan: Plan, jobs: Sequence[Job]) -> None:
-        self._left = [Order(plan, job) for job in reversed(jobs)]
-        self.any_done = False
-
-    @property
-    def ended(self) -> bool:
-        """See `Orders.ended`."""
-        return not self._left
-
-    def take(self) -> Order | None:
-        """See `Orders.take`."""
-        return self._left.pop() if self._left else None
 
 
 class Series:
@@ -96,7 +79,7 @@ class Series:
         """See `Orders.ended`."""
         return not self._missing
 
-    def take(self) -> Order | None:
+    def take(self) -> PlannedJob | None:
         """See `Orders.take`."""
         if self.ended:
             return None
@@ -110,7 +93,7 @@ class Series:
         if stop < end:
             self._missing.append((stop, end))
         self._handed_out[plan.key] += stop - start
-        return Order(plan, Job(plan.key, start, stop))
+        return PlannedJob(plan, Job(plan.key, start, stop))
 
     def _most(self, plan: Plan) -> int:
         """Rollouts that the next job of a plan may have."""

@@ -15,18 +15,26 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import model_validator
 
-from cluster.cells import number, percent
-from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, RESULTS_FILE, WITHOUT_TRIES, as_csv, share_of_gap
+from cluster.evaluation_tables import (
+    BEST_METHOD,
+    MEASURES,
+    ORDER,
+    RESULTS_FILE,
+    WITHOUT_TRIES,
+    ResultRow,
+    ResultRows,
+    share_of_gap,
+)
 from cluster.reporting.published import PUBLISHED_MEASURES, published_figure
 from cluster.reporting.style import COLOURS, SOFT
 from cluster.run_folder import RunFolder, find, read_json
 from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD, ObjectCounts
-from learner.training import without_nan
 from shared.configuration import parse
 from shared.errors import UsageError
 from shared.files import make_folder, write_atomically
+from shared.formatting import csv_table, finite, markdown_table, number, percent
 from shared.plain import markdown
 from shared.store import Store
 
@@ -45,16 +53,7 @@ COLUMNS = (
 _COUNTED = tuple(field.name for field in fields(ObjectCounts) if field.name != "object")
 
 
-class _Row(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
-
-    method: str = Field(max_length=100)
-    budget: int
-    best_f: float | None
-    bce: float | None
-    auc: float | None
-    base_rate: float | None
-    mean_tries: float | None
+class _Row(ResultRow):
     counts: ObjectCounts
 
     @model_validator(mode="after")
@@ -67,12 +66,7 @@ class _Row(BaseModel):
         return self
 
 
-class _Results(BaseModel):
-    """What is read of results.json."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    task: str = Field(max_length=100)
+class _Results(ResultRows):
     seed: int
     rollouts: int
     contents: Mapping[str, str]
@@ -118,7 +112,7 @@ class PooledRow:
             flat |= {name: value, f"{name}_low": low, f"{name}_high": high}
             flat |= {f"{name}_run_{run}": each for run, each in enumerate(self.by_run[name], start=1)}
         flat |= {f"paper_{name}": None if value is None else value / 100 for name, value in self.paper.items()}
-        return without_nan(flat | {"gap_closed": self.gap_closed, "trials": self.trials} | dict(self.averages))
+        return finite(flat | {"gap_closed": self.gap_closed, "trials": self.trials} | dict(self.averages))
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +257,7 @@ def write_comparison(out: Path, comparison: Comparison) -> None:
     """Write the four files; comparison.json comes last. Raises as `make_folder` does."""
     make_folder(out)
     rows = [row.flat() for row in comparison.rows]
-    write_atomically(out / CSV_FILE, as_csv(rows).encode())
+    write_atomically(out / CSV_FILE, csv_table(rows).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(comparison).encode())
     draw_comparison(comparison, out / FIGURE_FILE)
     told = {"task": comparison.task, "seeds": comparison.seeds, "objects": comparison.objects}
@@ -287,37 +281,37 @@ def as_markdown(comparison: Comparison) -> str:
         "and the oracle, which is told the hidden facts. The paper's figures are of other objects and another "
         "simulator: orders and trends can be compared.",
         "",
-        f"| {' | '.join(COLUMNS)} |",
-        "| --- |" + " ---: |" * (len(COLUMNS) - 1),
-    ]
-    for row in comparison.rows:
-        cells = [
-            markdown(row.method),
-            str(row.budget),
-            _with_limits(row.shares["f_score"]),
-            _of_paper(row.paper["f_score"]),
-            _with_limits(row.shares["sample_success"]),
-            _of_paper(row.paper["sample_success"]),
-            _with_limits(row.shares["start_success"]),
-            percent(row.gap_closed),
-            percent(row.averages["best_f"]),
-            number(row.averages["bce"]),
-            number(row.averages["auc"]),
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    columns = [f"seed {seed}" for seed in comparison.seeds]
-    lines += [
+        *markdown_table(COLUMNS, map(_cells, comparison.rows)),
         "",
         "Run by run (F-score / sample-success / from the start):",
         "",
-        "| method | tries | " + " | ".join(columns) + " |",
-        "| --- | ---: |" + " ---: |" * len(columns),
+        *markdown_table(
+            ("method", "tries", *(f"seed {seed}" for seed in comparison.seeds)),
+            ([markdown(row.method), str(row.budget), *_by_run(row)] for row in comparison.rows),
+        ),
     ]
-    for row in comparison.rows:
-        each = zip(*(row.by_run[name] for name in MEASURES), strict=True)
-        shown = [" / ".join(map(percent, values)) for values in each]
-        lines.append(f"| {markdown(row.method)} | {row.budget} | " + " | ".join(shown) + " |")
     return "\n".join(lines) + "\n"
+
+
+def _cells(row: PooledRow) -> list[str]:
+    return [
+        markdown(row.method),
+        str(row.budget),
+        _with_limits(row.shares["f_score"]),
+        _of_paper(row.paper["f_score"]),
+        _with_limits(row.shares["sample_success"]),
+        _of_paper(row.paper["sample_success"]),
+        _with_limits(row.shares["start_success"]),
+        percent(row.gap_closed),
+        percent(row.averages["best_f"]),
+        number(row.averages["bce"]),
+        number(row.averages["auc"]),
+    ]
+
+
+def _by_run(row: PooledRow) -> list[str]:
+    each = zip(*(row.by_run[name] for name in MEASURES), strict=True)
+    return [" / ".join(map(percent, values)) for values in each]
 
 
 def draw_comparison(comparison: Comparison, path: Path) -> None:

@@ -12,25 +12,23 @@ from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import ray
 from ray.exceptions import RayError, RayTaskError
 
 from cluster.blame import Backlog, Blame, Failure, of_environment
-from cluster.fleet import WAIT_S, WorkerFactory
+from cluster.fleet import WAIT_S
 from cluster.metrics import Cause, FleetMetrics
-from cluster.orders import Order, Orders
+from cluster.orders import Orders, PlannedJob
 from cluster.seats import Seat, Seats, Task
 from collector.actor import WorkerActor
 from collector.guard import Limits
+from collector.receipt import Receipt, WorkerFactory
 from shared.errors import AdaAffordError, WorkerError
 from shared.files import end_if_here
 from shared.plan import Job, Plan
 from shared.underway import Underway
-
-if TYPE_CHECKING:
-    from collector.receipt import Receipt
 
 START_LIMIT_S = 120.0
 """An actor's process imports an engine and PyTorch, which a busy machine or a cold disk may slow; no job's fault."""
@@ -145,7 +143,7 @@ class RayFleet:
         """See `Fleet.load_policy`: one `ray.put`; actors pull it when a plan first needs it."""
         self._policies.put(version, dict(files))
 
-    def run(self, orders: Orders, on_receipt: Callable[["Receipt"], None]) -> None:
+    def run(self, orders: Orders, on_receipt: Callable[[Receipt], None]) -> None:
         """See `Fleet.run`."""
         blame = Blame(self.workers)
         backlog = Backlog(orders, blame)
@@ -202,7 +200,7 @@ class RayFleet:
             seat.actor, seat.busy_since = self._call(), time.monotonic()
             self._ask(seat, None, seat.actor.arrive())
 
-    def _give(self, seat: Seat, order: Order, blame: Blame) -> None:
+    def _give(self, seat: Seat, order: PlannedJob, blame: Blame) -> None:
         """Submit an order to the seat's actor."""
         if not seat.tasks:
             seat.busy_since = time.monotonic()
@@ -212,13 +210,13 @@ class RayFleet:
         self._in_flight += 1
         self._ask(seat, order, seat.actor.run(plan, order.job, policy, blame.quarantined(order.job)))
 
-    def _ask(self, seat: Seat, order: Order | None, answer: "Future[Any]") -> None:
+    def _ask(self, seat: Seat, order: PlannedJob | None, answer: "Future[Any]") -> None:
         """Take note of what an actor was asked."""
         seat.tasks.append(Task(order, answer))
         self._seats.file(seat)
         answer.add_done_callback(lambda _: self._answered.put(seat))
 
-    def _take_in(self, seat: Seat, backlog: Backlog, blame: Blame, on_receipt: Callable[["Receipt"], None]) -> None:
+    def _take_in(self, seat: Seat, backlog: Backlog, blame: Blame, on_receipt: Callable[[Receipt], None]) -> None:
         """Report the receipt that has come for the seat's oldest task, or see to the failure."""
         task = seat.tasks[0]
         try:
@@ -288,7 +286,7 @@ class RayFleet:
         if not any(other.process for other in self._seats):
             blame.charge_nobody(f"the start of its process took more than {START_LIMIT_S:g} s")
 
-    def _note_done(self, seat: Seat, plan: Plan, receipt: "Receipt") -> None:
+    def _note_done(self, seat: Seat, plan: Plan, receipt: Receipt) -> None:
         """Tell log and metrics of a shard."""
         self._metrics.add(plan, receipt)
         about = {"plan": plan.key, "policy": plan.policy_version, "shard": receipt.shard_id, "worker": seat.process}
@@ -296,7 +294,7 @@ class RayFleet:
         about |= {"seconds": receipt.seconds.get("total", 0.0)}
         logger.info("shard %s is committed", receipt.shard_id, extra=about)
 
-    def _retire_if_grown(self, seat: Seat, receipt: "Receipt") -> None:
+    def _retire_if_grown(self, seat: Seat, receipt: Receipt) -> None:
         """Hand an actor no further jobs if its memory has grown by half of what it may grow by."""
         if seat.first_mb is None:
             seat.first_mb = receipt.memory_mb

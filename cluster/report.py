@@ -8,9 +8,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
-from cluster.cells import number
 from cluster.configuration import CampaignConfig
 from cluster.evaluation_tables import RESULTS_FILE
 from cluster.figures import collection_figures
@@ -18,6 +16,7 @@ from cluster.ledger import Ledger
 from cluster.run_folder import RunFolder, read_json
 from shared.errors import UsageError
 from shared.files import write_atomically
+from shared.formatting import terminal_table
 from shared.plain import plain
 from shared.policy import Policy
 from shared.store import Store
@@ -113,23 +112,19 @@ def _write_page(run: RunFolder, config: CampaignConfig, experiments: bool, say: 
 
 
 def _results_table(summary: dict[str, Any]) -> Table:
-    table = Table(title=Text(f"{plain(summary['task'])}: objects not seen in training"))
     figures = ("f_score", "sample_success", "start_success", "trials", "best_f", "bce", "auc", "base_rate")
     names = ("method", "budget", *figures)
-    for name in names:
-        table.add_column(name.replace("_", " "), justify="left" if name == "method" else "right")
-    for row in summary["rows"]:
-        table.add_row(*(_cell(row.get(name)) for name in names))
-    return table
+    rows = ([row.get(name) for name in names] for row in summary["rows"])
+    title = f"{summary['task']}: objects not seen in training"
+    return terminal_table(title, [name.replace("_", " ") for name in names], rows)
 
 
 def _rates_table(summary: dict[str, Any]) -> Table:
-    table = Table(title="random interactions, by category")
-    for name in ("category", "interactions", "successes", "success rate"):
-        table.add_column(name, justify="left" if name == "category" else "right")
-    for category, rate in summary["random_success_by_category"].items():
-        table.add_row(_cell(category), *(_cell(rate[name]) for name in ("interactions", "successes", "success_rate")))
-    return table
+    names = ("interactions", "successes", "success_rate")
+    rates = summary["random_success_by_category"].items()
+    rows = ([category, *(rate[name] for name in names)] for category, rate in rates)
+    head = ["category", *(name.replace("_", " ") for name in names)]
+    return terminal_table("random interactions, by category", head, rows)
 
 
 def _lines(summary: dict[str, Any], run: RunFolder) -> list[str]:
@@ -154,7 +149,3 @@ def _lines(summary: dict[str, Any], run: RunFolder) -> list[str]:
 
 def _shown(path: Path) -> str:
     return str(path) if path.exists() else f"(no {path.name})"
-
-
-def _cell(value: Any) -> Text:
-    return Text(plain(value) if isinstance(value, str) else number(value))

@@ -25,12 +25,12 @@ from pathlib import Path
 from typing import Any
 
 from cluster.configuration import EXECUTION_SETTINGS, CampaignConfig
-from cluster.settings import difference
 from shared.configuration import StrictModel, parse
 from shared.documents import parse_object
 from shared.errors import UsageError
 from shared.files import create_exclusively, read_bounded, write_atomically
 from shared.plan import ObjectRef
+from shared.store.difference import differences
 from shared.store.provenance import software_versions
 
 MAX_DOCUMENT_BYTES = 64 << 20
@@ -192,11 +192,12 @@ def begin(path: Path, config: CampaignConfig) -> RunFolder:
     if create_exclusively(run.config, json.dumps(document, indent=2).encode()):
         return run
     before, now = (_decisive(each) for each in (_read_config(run), settings))
-    changed = difference(before, now)
-    if changed is not None:
-        moved = f" --objects {config.objects}" if changed.startswith("'objects'") and config.objects else ""
+    if (changed := next(differences(before, now), None)) is not None:
+        name, was, given = changed
+        moved = f" --objects {config.objects}" if name == "objects" and config.objects else ""
         raise UsageError(
-            f"{path}: holds another run ({changed}); name a new folder, or `adaafford resume {path}{moved}`"
+            f"{path}: holds another run ('{name}' was {was}, is now {given}); name a new folder, or "
+            f"`adaafford resume {path}{moved}`"
         )
     return run
 

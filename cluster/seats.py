@@ -11,7 +11,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
 
-from cluster.orders import Order
+from cluster.orders import PlannedJob
 from shared.underway import Crumb, Underway
 
 IN_FLIGHT = 2
@@ -27,7 +27,7 @@ class Task:
         answer: its process's name, or the receipt.
     """
 
-    order: Order | None
+    order: PlannedJob | None
     answer: "Future[Any]"
 
 
@@ -50,7 +50,7 @@ class Seat:
     """Whether it is only to finish what it has."""
 
     @property
-    def orders(self) -> list[Order]:
+    def orders(self) -> list[PlannedJob]:
         """What it holds, oldest first."""
         return [task.order for task in self.tasks if task.order is not None]
 

@@ -18,8 +18,9 @@ from typing import Any
 
 import psutil
 
-from cluster.fleet import Fleet, SerialFleet, WorkerFactory
+from cluster.fleet import Fleet, SerialFleet
 from collector.guard import Limits
+from collector.receipt import WorkerFactory
 from shared.errors import StoreError, UsageError, WorkerError
 from shared.extras import require_packages
 from shared.files import is_gone, process_name, read_bounded, remove_if_abandoned, remove_tree, temporary_name

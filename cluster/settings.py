@@ -1,6 +1,7 @@
 """From defaults, a preset, a file and flags to one validated model: later ones win, and every setting has a flag."""
 
 import argparse
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import GenericAlias
@@ -22,6 +23,8 @@ PRESETS_FOLDER = Path(__file__).parent / "presets"
 
 Model = TypeVar("Model", bound=BaseModel)
 Command = TypeVar("Command")
+Action = tuple[type[Any], Callable[[Any], int]]
+"""What declares the flags of an action, and what is run with them; returns the exit code."""
 
 FLAG_STYLE = (tyro.conf.AvoidSubcommands, tyro.conf.EnumChoicesFromValues)
 FLAG_TYPES = ConstructorRegistry()
@@ -126,14 +129,26 @@ def parse_flags(
     return parsed
 
 
-def difference(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> str | None:
-    """The first setting in which two configurations differ, as "name: before, now after"; None if they agree."""
-    for key in sorted(before.keys() | after.keys()):
-        old, new = before.get(key), after.get(key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            found = difference(old, new, f"{prefix}{key}.")
-            if found:
-                return found
-        elif old != new:
-            return f"'{prefix}{key}' was {old!r}, is now {new!r}"
-    return None
+def dispatch(name: str, actions: Mapping[str, Action], args: list[str], operand: str) -> int:
+    """Run the action of a command that its first argument names.
+
+    Args:
+        name: of the command, such as "store".
+        actions: by name: what declares the flags, and what is run with them.
+        args: those of the command.
+        operand: what a usage line shows behind the action.
+
+    Raises:
+        UsageError: there is no such action, or a flag is wrong.
+    """
+    chosen, first = args[:1], next(iter(actions))
+    if chosen in (["-h"], ["--help"]):
+        print(
+            f"usage: adaafford {name} {{{','.join(actions)}}} {operand}; `adaafford {name} {first} --help` tells more"
+        )
+        return 0
+    if not chosen or chosen[0] not in actions:
+        given = f"'{chosen[0]}'" if chosen else "nothing"
+        raise UsageError(f"{name} needs one of {', '.join(actions)}; given {given}")
+    command, execute = actions[chosen[0]]
+    return execute(parse_flags(command, args[1:], f"{name} {chosen[0]}"))

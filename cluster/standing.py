@@ -14,7 +14,7 @@ from typing import Any
 from cluster.ledger import Ledger
 from cluster.run_folder import RunFolder
 from cluster.status import DriverStatus, read_status
-from learner.names import METRICS_FILE, PUBLISHED_FILE
+from learner.configuration import METRICS_FILE, PUBLISHED_FILE
 from shared.errors import UsageError
 from shared.plan import Job, covered
 from shared.store import Store

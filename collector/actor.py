@@ -1,29 +1,14 @@
 """The Ray actor: a thin wrapper around a worker that pulls weights by version. The only module here that knows Ray."""
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Mapping
 
 import ray
 
-from collector.guard import Guard, Limits, UnderWay
+from collector.guard import Guard, Limits
+from collector.receipt import JobWorker, Receipt, WorkerFactory
 from shared.files import process_name
 from shared.plan import Job, Plan
 from shared.underway import Underway
-
-if TYPE_CHECKING:
-    from collector.receipt import Receipt
-
-
-class WrappedWorker(Protocol):
-    """What is wrapped; `collector.worker.Worker` in earnest, a fake in tests."""
-
-    def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
-        """Make the policy `version` ready."""
-        ...
-
-    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> "Receipt":
-        """Execute and commit `job`; see `collector.worker.Worker.run`."""
-        ...
 
 
 class WorkerActor:
@@ -39,10 +24,10 @@ class WorkerActor:
         limits: what a rollout may take.
     """
 
-    def __init__(self, make_worker: Callable[[], WrappedWorker], underway: Underway, limits: Limits) -> None:
+    def __init__(self, make_worker: WorkerFactory, underway: Underway, limits: Limits) -> None:
         self._make_worker = make_worker
         self._guard = Guard(underway, limits)
-        self._worker: WrappedWorker | None = None
+        self._worker: JobWorker | None = None
         self._broken = False
         self._plans: dict[str, Plan] = {}
         self._loaded: set[int] = set()
@@ -58,7 +43,7 @@ class WorkerActor:
         job: Job,
         policy: "list[ray.ObjectRef[Mapping[str, bytes]]]",
         quarantined: Mapping[int, str],
-    ) -> "Receipt":
+    ) -> Receipt:
         """Execute `job` and return its receipt; arrays never cross.
 
         Args:
@@ -87,7 +72,7 @@ class WorkerActor:
             self._plans[key] = ray.get(ref)
         return self._plans[key]
 
-    def _live_worker(self) -> WrappedWorker:
+    def _live_worker(self) -> JobWorker:
         """The worker, made if there is none."""
         if self._worker is None:
             self._worker = self._make_worker()

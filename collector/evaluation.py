@@ -10,25 +10,18 @@ from collections.abc import Callable
 
 import numpy as np
 
-from collector.clock import StageClock
 from collector.proposers import RandomProposer
-from collector.recorder import Recorder, try_from_one_state, try_repeatedly
+from collector.recorder import Recorder
 from shared import seeds
 from shared.methods import method_named
 from shared.plan import Plan
-from shared.vocabulary import Float, Interaction, Order, Proposer, Role
+from shared.vocabulary import Float, Interaction, Proposer, Role
 
 ProposerFactory = Callable[[str, np.random.Generator, int], Proposer]
 """Makes the proposer of a name, such as "aip", with its own randomness, of a policy version."""
 
 
-def evaluate(
-    plan: Plan,
-    index: int,
-    recorder: Recorder,
-    make_proposer: ProposerFactory,
-    clock: StageClock,
-) -> None:
+def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: ProposerFactory) -> None:
     """Run every method of the plan on the environment's present state.
 
     Args:
@@ -36,7 +29,6 @@ def evaluate(
         index: number of the rollout.
         recorder: of the environment, in its start state.
         make_proposer: makes the proposers that the methods name.
-        clock: sums wall time by stage.
     """
     config = plan.setting.evaluation
     assert config is not None, "an evaluation setting says what to evaluate"
@@ -47,7 +39,9 @@ def evaluate(
     environment = recorder.environment
     edge_share = plan.setting.terms.edge_share
     start = environment.state()
-    try_from_one_state(recorder, RandomProposer(rng("queries"), edge_share), config.queries, Role.QUERY, clock)
+    recorder.interact(RandomProposer(rng("queries"), edge_share), config.queries, Role.QUERY, start=start)
+    if recorder.sound:
+        environment.restore(start)
     for name in config.methods:
         if not recorder.sound:
             return
@@ -61,7 +55,7 @@ def evaluate(
             context = RandomProposer(rng(f"context/{name}"), edge_share)
         elif method.tries is not None:
             context = make_proposer(method.tries, rng(f"context/{name}"), version)
-        _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), start, clock)
+        _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), start)
 
 
 def _adapt(
@@ -71,23 +65,19 @@ def _adapt(
     exploiter: Proposer,
     budgets: list[int],
     start: Float,
-    clock: StageClock,
 ) -> None:
     """Fill the set of interactions one try at a time; at each budget, execute what the method would do, and undo it."""
     environment, history = recorder.environment, list[Interaction]()
     for budget in budgets:
         if context is not None:  # A proposer that has seen enough leaves the greater budgets with what there is.
-            try_repeatedly(recorder, context, budget, Role.CONTEXT, history, method, clock)
+            left_to_try = budget - len(history)
+            history += recorder.interact(context, left_to_try, Role.CONTEXT, history=history, method=method)
         if not recorder.sound or not environment.observe().movable.any():
             return
         left = environment.state()
         # Without tries, the one is the other.
         for role, state in ((Role.EXPLOIT, left), (Role.EXPLOIT_AT_START, start))[: 1 if context is None else 2]:
-            environment.restore(state)
-            with clock.stage("propose"):
-                action = exploiter.propose(environment.observe(), history)
-            assert action is not None, "an exploiter never stops"
-            recorder.try_action(action, exploiter.name, Order.RESTART, role, method, budget)
+            recorder.interact(exploiter, 1, role, history=history, start=state, method=method, budget=budget)
             if not recorder.sound:
                 return
         environment.restore(left)

@@ -17,13 +17,14 @@ from collector.gripper import finger, palm
 from collector.preview import part_colours, save, shaded
 from collector.primitives import Trial
 from collector.proposers import RandomProposer
+from collector.recorder import interact
 from collector.scene import Scene
 from shared import seeds
 from shared.configuration import CameraConfig, Fidelity
 from shared.errors import UsageError
 from shared.geometry import camera_pose
 from shared.tasks import task_named
-from shared.vocabulary import Action, Float, HiddenDynamics, Outcome, Primitive
+from shared.vocabulary import Action, Float, HiddenDynamics, Observation, Outcome, Primitive
 
 FIDELITY = Fidelity(name="film", skip_free_flight=False)
 DYNAMICS = HiddenDynamics(part_mass=0.2, joint_friction=0.3, surface_friction=2.0)
@@ -165,17 +166,18 @@ def _takes(target: ArticulatedObject, primitive: Primitive, seed: int) -> Iterat
     pose = camera_pose(*SEEN_FROM, camera.distance)
     environment = SapienEnvironment(target, task, primitive, DYNAMICS, pose, camera, FIDELITY, pixels, StageClock())
     proposer = RandomProposer(actions, EDGE_SHARE)
+    take: Take
+
+    def execute(observation: Observation, action: Action) -> Outcome:
+        nonlocal take
+        part = int(observation.part_ids[action.point_index])
+        take = FilmedTrial(environment.scene, action, part, primitive).take()
+        return take.outcome
+
     for _ in range(STATES):
-        if not (environment.reset(states) and environment.shows_a_target()):
-            continue
-        observation, positions = environment.observe(), environment.state()
-        for _ in range(TRIES):
-            action = proposer.propose(observation, ())
-            assert action is not None, "the observation shows a target"
-            environment.restore(positions)
-            yield FilmedTrial(
-                environment.scene, action, int(observation.part_ids[action.point_index]), primitive
-            ).take()
+        if environment.reset(states) and environment.shows_a_target():
+            for _ in interact(environment, proposer, TRIES, start=environment.state(), execute=execute):
+                yield take
 
 
 def _pose_of(scene: Scene) -> Pose:

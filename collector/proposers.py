@@ -1,6 +1,7 @@
-"""The random proposer: trial and error without a policy."""
+"""Proposers that need no policy: random actions, and given ones."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,28 @@ class RandomProposer:
         if self._edges is None or self._edges[0] is not observation:
             self._edges = observation, edge_points(observation)
         return self._edges[1]
+
+
+class RepeatingProposer:
+    """Proposes given actions in order, each at the point nearest to its own that the task may act on.
+
+    Args:
+        actions: of another environment of the same object.
+    """
+
+    name = "repeating"
+
+    def __init__(self, actions: Sequence[Action]) -> None:
+        self._actions = iter(actions)
+
+    def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
+        """The next action, or None after the last one."""
+        action = next(self._actions, None)
+        if action is None:
+            return None
+        movable = np.flatnonzero(observation.movable)
+        nearest = movable[np.linalg.norm(observation.points[movable] - action.point, axis=1).argmin()]
+        return replace(action, point_index=int(nearest))
 
 
 def edge_points(observation: Observation) -> NDArray[np.int64]:

@@ -1,6 +1,11 @@
-"""What a worker tells of a job; no engine is imported for it."""
+"""What a worker is asked to do with a job, and what it tells of it; neither an engine nor Ray is imported for it."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
+
+from collector.guard import UnderWay
+from shared.plan import Job, Plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,3 +33,19 @@ class Receipt:
     quarantined: int = 0
     memory_mb: float = 0.0
     empty: dict[str, dict[str, int]] = field(default_factory=dict)
+
+
+class JobWorker(Protocol):
+    """Executes jobs: `collector.worker.Worker`, or a fake in tests."""
+
+    def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
+        """Make the policy `version` ready for plans that use it."""
+        ...
+
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> Receipt:
+        """Execute and commit `job`; do nothing if that was done before. See `collector.worker.Worker.run`."""
+        ...
+
+
+WorkerFactory = Callable[[], JobWorker]
+"""Makes a worker in the process that will use it; must be picklable for a fleet of processes."""

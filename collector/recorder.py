@@ -1,6 +1,7 @@
-"""The loop that every rollout runs, and what it writes down."""
+"""The loop that observes, proposes and executes, and what a rollout writes down of it."""
 
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +13,50 @@ from collector.primitives import hand_start
 from collector.proposers import RandomProposer
 from shared.geometry import quaternion_from_rotation
 from shared.records import InteractionRecord
-from shared.vocabulary import Action, Interaction, Observation, Order, OutcomeKind, Proposer, Role
+from shared.vocabulary import Action, Float, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role
+
+
+def interact(
+    environment: SapienEnvironment,
+    proposer: Proposer,
+    most: int,
+    *,
+    history: Sequence[Interaction] = (),
+    start: Float | None = None,
+    execute: Callable[[Observation, Action], Outcome] | None = None,
+    clock: StageClock | None = None,
+) -> Iterator[Interaction]:
+    """The loop of the paper's test time: observe, propose, execute, remember.
+
+    It ends after `most` interactions, or earlier where the proposer proposes nothing, where no point that the task may
+    act on is in view (a part can swing out of the camera's sight), or after the simulation has diverged.
+
+    Args:
+        environment: to act in.
+        proposer: chooses the actions.
+        most: interactions.
+        history: interactions that the proposer knows already; it is given those of this loop as well.
+        start: [parts], a state that is put back before each interaction. None: each continues from the last.
+        execute: executes an action of an observation instead of the environment, and may note what else it sees.
+        clock: sums wall time by stage.
+    """
+    clock = clock or StageClock()
+    known = list(history)
+    for _ in range(most):
+        if start is not None:
+            environment.restore(start)
+        observation = environment.observe()
+        if not observation.movable.any():
+            return
+        with clock.stage("propose"):
+            action = proposer.propose(observation, known)
+        if action is None:
+            return
+        outcome = execute(observation, action) if execute else environment.execute(action)
+        known.append(Interaction(observation, action, outcome))
+        yield known[-1]
+        if outcome.kind is OutcomeKind.UNSTABLE:
+            return  # Nothing that this scene shows later can be believed.
 
 
 @dataclass(slots=True)
@@ -21,16 +65,62 @@ class Recorder:
 
     environment: SapienEnvironment
     policy_version: int
+    clock: StageClock
     observations: list[Observation] = field(default_factory=list)
     interactions: list[InteractionRecord] = field(default_factory=list)
 
-    def try_action(
-        self, action: Action, proposer: str, order: Order, role: Role, method: str = "", budget: int = -1
-    ) -> Interaction:
-        """Execute an action from the environment's present state and write down what came of it."""
+    def interact(
+        self,
+        proposer: Proposer,
+        most: int,
+        role: Role,
+        *,
+        history: Sequence[Interaction] = (),
+        start: Float | None = None,
+        method: str = "",
+        budget: int = -1,
+    ) -> list[Interaction]:
+        """Run the loop and write down every interaction; see the function `interact`.
+
+        Args:
+            proposer: chooses the actions.
+            most: interactions.
+            role: what the interactions are for.
+            history: interactions that the proposer knows already.
+            start: [parts], a state that is put back before each interaction. None: each continues from the last.
+            method: whose interactions these are, in evaluation.
+            budget: how many interactions the method had before, in evaluation.
+
+        Returns:
+            The interactions of this loop.
+        """
+        order = Order.CONTINUE if start is None else Order.RESTART
+
+        def execute(observation: Observation, action: Action) -> Outcome:
+            return self._execute(observation, action, proposer.name, order, role, method, budget)
+
+        loop = interact(
+            self.environment, proposer, most, history=history, start=start, execute=execute, clock=self.clock
+        )
+        return list(loop)
+
+    @property
+    def sound(self) -> bool:
+        """Whether the simulation has not diverged; nothing that follows could be believed."""
+        return not self.interactions or self.interactions[-1].outcome.kind is not OutcomeKind.UNSTABLE
+
+    def _execute(
+        self,
+        observation: Observation,
+        action: Action,
+        proposer: str,
+        order: Order,
+        role: Role,
+        method: str,
+        budget: int,
+    ) -> Outcome:
+        """Execute an action and write down what came of it."""
         environment = self.environment
-        observation = environment.observe()
-        place = self._place_of(observation)
         part = int(observation.part_ids[action.point_index])
         body = environment.object.bodies[part]
         assert body.joint is not None
@@ -41,7 +131,7 @@ class Recorder:
         self.interactions.append(
             InteractionRecord(
                 step=len(self.interactions),
-                observation=place,
+                observation=self._place_of(observation),
                 action=action,
                 outcome=outcome,
                 normal=observation.normals[action.point_index].astype(np.float64),
@@ -63,12 +153,7 @@ class Recorder:
                 seconds=time.perf_counter() - begun,
             )
         )
-        return Interaction(observation, action, outcome)
-
-    @property
-    def sound(self) -> bool:
-        """Whether the simulation has not diverged; nothing that follows could be believed."""
-        return not self.interactions or self.interactions[-1].outcome.kind is not OutcomeKind.UNSTABLE
+        return outcome
 
     def _place_of(self, observation: Observation) -> int:
         """Where the observation is kept; a new one is added."""
@@ -77,51 +162,3 @@ class Recorder:
                 return place
         self.observations.append(observation)
         return len(self.observations) - 1
-
-
-def try_repeatedly(
-    recorder: Recorder,
-    proposer: Proposer,
-    most: int,
-    role: Role,
-    history: list[Interaction],
-    method: str,
-    clock: StageClock,
-) -> None:
-    """The loop of the paper's test time: observe, propose, execute, remember; each try continues from the last.
-
-    Args:
-        recorder: of the environment to act in.
-        proposer: chooses what to try; it ends the loop by proposing nothing.
-        most: how long the history may become.
-        role: what the tries are for.
-        history: what is known already; the tries are added to it.
-        method: whose tries these are, in evaluation.
-        clock: sums wall time by stage.
-    """
-    while recorder.sound and len(history) < most:
-        observation = recorder.environment.observe()
-        if not observation.movable.any():  # A part can swing out of the camera's sight.
-            return
-        with clock.stage("propose"):
-            action = proposer.propose(observation, history)
-        if action is None:
-            return
-        history.append(recorder.try_action(action, proposer.name, Order.CONTINUE, role, method))
-
-
-def try_from_one_state(recorder: Recorder, proposer: Proposer, count: int, role: Role, clock: StageClock) -> None:
-    """Several actions from the environment's present state, which is put back before each and in the end."""
-    environment = recorder.environment
-    observation = environment.observe()
-    state = environment.state()
-    for _ in range(count):
-        environment.restore(state)
-        with clock.stage("propose"):
-            action = proposer.propose(observation, ())
-        if action is None:
-            return
-        recorder.try_action(action, proposer.name, Order.RESTART, role)
-        if not recorder.sound:
-            return
-    environment.restore(state)

@@ -8,7 +8,7 @@ from collector.draws import Draw, draw_rollout
 from collector.environment import SapienEnvironment
 from collector.evaluation import ProposerFactory, evaluate
 from collector.proposers import RandomProposer
-from collector.recorder import Recorder, try_from_one_state, try_repeatedly
+from collector.recorder import Recorder
 from shared import seeds
 from shared.geometry import camera_pose
 from shared.plan import Plan
@@ -42,11 +42,11 @@ def run_rollout(
         rested = True
         if not environment.shows_a_target():
             continue
-        recorder = Recorder(environment, plan.policy_version)
+        recorder = Recorder(environment, plan.policy_version, clock)
         if plan.setting.kind == "evaluation":
-            evaluate(plan, index, recorder, make_proposer, clock)
+            evaluate(plan, index, recorder, make_proposer)
         else:
-            collect(plan, index, recorder, states, make_proposer, clock)
+            collect(plan, index, recorder, states, make_proposer)
         return _record(plan, draw, RolloutStatus.OK, recorder)
     return _record(plan, draw, RolloutStatus.NOTHING_TO_ACT_ON if rested else RolloutStatus.NEVER_AT_REST, None)
 
@@ -84,12 +84,7 @@ def make_environment(
 
 
 def collect(
-    plan: Plan,
-    index: int,
-    recorder: Recorder,
-    states: np.random.Generator,
-    make_proposer: ProposerFactory,
-    clock: StageClock,
+    plan: Plan, index: int, recorder: Recorder, states: np.random.Generator, make_proposer: ProposerFactory
 ) -> None:
     """Training data: tries that continue, a policy's if there is one; then random ones from one state after another."""
     rollout = plan.setting.collection.rollout
@@ -101,19 +96,22 @@ def collect(
         first, most = make_proposer(plan.proposer, rng, plan.policy_version), rollout.context
     else:
         first, most = random, rollout.interactions if rollout.order is Order.CONTINUE else rollout.continued
+    start = environment.state()
     if most:
-        start = environment.state()
-        try_repeatedly(recorder, first, min(most, rollout.interactions), Role.COLLECT, [], "", clock)
+        recorder.interact(first, min(most, rollout.interactions), Role.COLLECT)
         if recorder.sound:
             environment.restore(start)
     while recorder.sound and (left := rollout.interactions - len(recorder.interactions)) > 0:
         one_state = environment.task.closed  # Every draw of a state would give the same one.
-        before = len(recorder.interactions)
         count = left if one_state else min(left, rollout.actions_per_state)
-        try_from_one_state(recorder, random, count, Role.COLLECT, clock)
-        if one_state or not recorder.sound or not _next_state(environment, states):
+        state = environment.state()
+        done = recorder.interact(random, count, Role.COLLECT, start=state)
+        if one_state or not recorder.sound:
             break
-        assert len(recorder.interactions) > before, "a state without targets is never used"
+        assert done, "a state without targets is never used"
+        environment.restore(state)
+        if not _next_state(environment, states):
+            break
 
 
 def _next_state(environment: SapienEnvironment, states: np.random.Generator) -> bool:

@@ -1,4 +1,4 @@
-"""Stage 2: Adaptive Affordance Prediction, as in the paper or from an oracle that was told the hidden facts.
+"""Stage 2: Adaptive Affordance PrefixPrediction, as in the paper or from an oracle that was told the hidden facts.
 
 Shapes: I interactions, B rollouts, n rows of each, K the longest context.
 """
@@ -60,7 +60,7 @@ class SeenRows:
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class PrefixPrediction:
     """What AAP makes of ordered rows after every prefix of their context.
 
     Attributes:
@@ -235,9 +235,9 @@ class OracleStage:
         return {"score": found.bce, "base_rate": found.base_rate} | figures
 
 
-def predict(aap: Aap, seen: SeenRows, context: int) -> Prediction:
+def predict(aap: Aap, seen: SeenRows, context: int) -> PrefixPrediction:
     """Score all rows after every prefix of the first `context` of them."""
     tries = (seen.features, seen.xyz, seen.frame, seen.motion, seen.success)
     latents = aap.prefix_latents(*aap.interaction_codes(*(x[:, :context] for x in tries)))
     xyz, frames = seen.xyz[:, None], seen.frame[:, None]
-    return Prediction(aap.action_logits(seen.features[:, None], xyz, frames, latents[:, :, None]), latents)
+    return PrefixPrediction(aap.action_logits(seen.features[:, None], xyz, frames, latents[:, :, None]), latents)

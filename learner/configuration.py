@@ -1,4 +1,4 @@
-"""Settings of the learner; the defaults fit a few thousand interactions and two cores."""
+"""Settings of the learner, whose defaults fit a few thousand interactions and two cores, and names of its files."""
 
 from typing import Literal
 
@@ -6,6 +6,11 @@ from pydantic import Field
 
 from shared.configuration import StrictModel
 from shared.networks.configuration import NetworkConfig
+
+METRICS_FILE = "metrics.jsonl"
+"""Of a training: one line a validation."""
+PUBLISHED_FILE = "published.json"
+"""Of a learner beside collection: which version each of its policies became."""
 
 
 class TrainingConfig(StrictModel):

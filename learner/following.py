@@ -19,8 +19,8 @@ from typing import Annotated
 from pydantic import Field, RootModel
 
 from learner import sharing
+from learner.configuration import PUBLISHED_FILE
 from learner.data import kept_for_validation
-from learner.names import PUBLISHED_FILE
 from learner.stages import StageJob
 from shared.documents import read_document
 from shared.errors import StoreError

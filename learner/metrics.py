@@ -114,7 +114,8 @@ def area_under_roc(scores: NDArray[np.float64], labels: NDArray[np.bool_]) -> fl
     positives, negatives = int(labels.sum()), int((~labels).sum())
     if not positives or not negatives:
         return float("nan")
-    return float((_ranks(scores)[labels].sum() - positives * (positives + 1) / 2.0) / (positives * negatives))
+    ranks = _ranks(scores)[labels]
+    return float((ranks.sum() - positives * (positives + 1) / 2.0) / (positives * negatives))
 
 
 def rank_correlation(scores: ArrayLike, others: ArrayLike) -> float:
@@ -127,11 +128,11 @@ def correlation(values: ArrayLike, others: ArrayLike) -> float:
     pair = np.array([values, others], dtype=np.float64)
     if pair.shape[1] < 2 or (pair.std(axis=1) == 0).any():
         return float("nan")
-    return float(np.mean(np.prod(pair - pair.mean(axis=1, keepdims=True), axis=0)) / np.prod(pair.std(axis=1)))
+    return float(np.asarray(np.corrcoef(pair))[0, 1])
 
 
 def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Ranks from 1, ties sharing their mean."""
+    """Ranks from 1, ties sharing their mean, as `scipy.stats.rankdata`, which takes half a second to import."""
     _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
     mean_ranks = np.cumsum(counts) - (counts - 1) / 2.0
     return np.asarray(mean_ranks[inverse], dtype=np.float64)

@@ -24,17 +24,17 @@ from pydantic import BaseModel, Field
 
 from learner import sharing
 from learner.checkpoint import check_fingerprint, read_cursor
-from learner.configuration import LearnerConfig
+from learner.configuration import METRICS_FILE, LearnerConfig
 from learner.data import Dataset, Split, load_dataset, split, without_later
 from learner.features import FrozenFeatures
 from learner.hardware import Hardware
-from learner.names import METRICS_FILE
 from learner.oracle import read_oracle
 from learner.recipes import AFFORDANCE_FOLDER, ORACLE_FILE, ORACLE_FOLDER, Recipe, Runner
-from learner.training import CHECKPOINT_FILE, TrainingResult, without_nan
+from learner.training import CHECKPOINT_FILE, TrainingResult
 from shared.documents import read_document
 from shared.errors import UsageError
 from shared.files import exclusive_lock, read_bounded, write_atomically
+from shared.formatting import finite
 from shared.methods import ModuleName
 from shared.networks.configuration import NetworkConfig
 from shared.policy import (
@@ -200,7 +200,7 @@ def _finish(job: StageJob, policy: Policy, result: TrainingResult, fingerprint: 
     """Write what the stage made, and clear away what only it needed."""
     for name, data in policy.to_files().items():
         write_atomically(job.out / name, data)
-    done = {"stage": job.stage, "fingerprint": fingerprint, **asdict(result), "metrics": without_nan(result.metrics)}
+    done = {"stage": job.stage, "fingerprint": fingerprint, **asdict(result), "metrics": finite(result.metrics)}
     done["objects"] = sorted(seen)
     write_atomically(job.out / DONE_FILE, json.dumps(done, indent=1).encode())
     for folder in CHECKPOINT_FOLDERS:

@@ -6,6 +6,7 @@ resumed gives the same bits as one that was not (on one kind of CPU, with one nu
 
 import json
 import math
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,13 +20,13 @@ from torch.nn.parallel import DistributedDataParallel
 
 from learner import sharing
 from learner.checkpoint import Cursor, check_fingerprint, read_checkpoint, read_cursor, write_checkpoint
-from learner.configuration import TrainingConfig
+from learner.configuration import METRICS_FILE, TrainingConfig
 from learner.events import EVENTS_FOLDER, EventFiles
 from learner.hardware import Hardware
-from learner.names import METRICS_FILE
-from learner.progress import ProgressReport, Standing
 from shared.errors import UsageError
 from shared.files import read_bounded
+from shared.formatting import finite
+from shared.progress import Progress, minutes
 from shared.seeds import generator
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
@@ -158,20 +159,40 @@ class _Loop:
     def run(self, title: str, silent: bool) -> TrainingResult:
         """Step until the steps, the seconds or the patience are used up."""
         config, silent = self.config, silent or sharing.rank() > 0
-        with ProgressReport(title, config.steps, config.seconds, self.cursor.step, silent=silent) as report:
+        # Plain lines go to standard output, where a campaign reads them from its trainer and passes them on.
+        progress = Progress(
+            title,
+            config.steps,
+            unit="steps",
+            done=self.cursor.step,
+            details=self._details,
+            live=not silent and sys.stdout.isatty() and sys.stderr.isatty(),
+            say=_print_nothing if silent else _print_line,
+        )
+        with progress:
             while not self._finished():
                 self._step()
-                report.update(self._standing())
-        report.finish(self._standing(), self.cursor.best_step)
+                left = math.inf if config.seconds is None else max(config.seconds - self.cursor.seconds, 0.0)
+                progress.show(self.cursor.step, most_left_s=left)
+        progress.say(self._summary(title))
         self.stage.module.load_state_dict(self.best)
         self.stage.module.eval()
         cursor = self.cursor
         return TrainingResult(cursor.step, cursor.best_step, cursor.seconds, cursor.interactions, cursor.best_metrics)
 
-    def _standing(self) -> Standing:
+    def _details(self) -> str:
+        """The loss, the speed and the best score so far."""
+        best = f", best score {self.cursor.best_score:.4f}" if self.cursor.best_metrics else ""
+        return f"loss {self._loss:.4f}, {self._rate():,.0f} interactions/s{best}"
+
+    def _summary(self, title: str) -> str:
         cursor = self.cursor
-        best = cursor.best_score if cursor.best_metrics else None
-        return Standing(cursor.step, self._loss, cursor.interactions, cursor.seconds, best)
+        best = f", best score {cursor.best_score:.4f} at step {cursor.best_step}" if cursor.best_metrics else ""
+        return f"{title}: {cursor.step} steps in {minutes(cursor.seconds)}, {self._rate():,.0f} interactions/s{best}"
+
+    def _rate(self) -> float:
+        """Interactions a second, over all sittings."""
+        return self.cursor.interactions / max(self.cursor.seconds, 1e-9)
 
     def _finished(self) -> bool:
         spent = self.config.seconds is not None and self.cursor.seconds >= self.config.seconds
@@ -231,8 +252,8 @@ class _Loop:
         }
         if self._viewer is not None:
             with (self.out / METRICS_FILE).open("a", encoding="utf-8") as file:
-                file.write(json.dumps(without_nan(line)) + "\n")
-            self._viewer.add(self.cursor.step, without_nan(line))
+                file.write(json.dumps(finite(line)) + "\n")
+            self._viewer.add(self.cursor.step, finite(line))
 
     def _save(self) -> None:
         if sharing.rank() > 0:
@@ -272,16 +293,17 @@ def rate_factor(config: TrainingConfig, step: int) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * (done - WARMING) / (1.0 - WARMING)))
 
 
-def without_nan(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values with null for what is not a number, which JSON cannot say."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()
-    }
-
-
 def _parsed(line: str) -> dict[str, Any] | None:
     try:
         parsed = json.loads(line)
     except (ValueError, RecursionError):
         return None
     return parsed if isinstance(parsed, dict) and isinstance(parsed.setdefault("step", 0), int | float) else None
+
+
+def _print_line(line: str) -> None:
+    print(line, flush=True)
+
+
+def _print_nothing(_: str) -> None:
+    """Another process speaks for this one."""

@@ -7,9 +7,10 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from shared.documents import MAX_PROBLEMS, MAX_WORD, printable
+from shared.documents import MAX_PROBLEMS
 from shared.errors import UsageError
 from shared.files import read_named
+from shared.plain import MAX_WORD, plain
 from shared.vocabulary import Order, Primitive
 
 MAX_CONFIGURATION_BYTES = 1 << 18
@@ -214,7 +215,7 @@ def load_toml(path: Path) -> dict[str, Any]:
             raise ValueError(f"a line with more than {MAX_DOTS} dots")
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: not valid TOML ({printable(str(error), 200)}); correct it") from None
+        raise UsageError(f"{path}: not valid TOML ({plain(str(error), 200)}); correct it") from None
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -233,7 +234,7 @@ def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
     problems = error.errors()
     problem = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
     location = [str(part) for part in problem["loc"]]
-    name = printable(".".join(location)) or "the file"
+    name = plain(".".join(location), MAX_WORD) or "the file"
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     if problem["type"] == "extra_forbidden":
         known = sorted(_fields_at(model, location[:-1]))
@@ -246,7 +247,7 @@ def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
 def _shown(value: object) -> str:
     """A value as a message has it; an integer of thousands of digits cannot be written."""
     try:
-        return repr(printable(str(value)))
+        return repr(plain(str(value), MAX_WORD))
     except (ValueError, RecursionError):
         return f"a value of type {type(value).__name__}"
 

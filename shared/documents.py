@@ -10,13 +10,12 @@ from pydantic_core import from_json
 
 from shared.errors import StoreError
 from shared.files import read_bounded
+from shared.plain import MAX_WORD, plain
 
 MAX_VALUES = 1 << 20
 """Of a document: a hostile one has a value in every three bytes, and each takes a hundred bytes of memory and more."""
 MAX_PROBLEMS = 1000
 """A document with more is only said to have so many: their list alone could take gigabytes."""
-MAX_WORD = 80
-"""Characters of what a file says that a message repeats."""
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -77,12 +76,7 @@ def problem_of(error: ValidationError) -> str:
         return f"{error.error_count()} values are not allowed"
     problem = error.errors(include_url=False, include_context=False, include_input=False)[0]
     place = ".".join(map(str, problem["loc"])) or "content"
-    return f"{printable(place)}: {printable(problem['msg'], 100)}"
-
-
-def printable(text: str, most: int = MAX_WORD) -> str:
-    """The beginning of a text from a file, fit for a message of one line."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text[:most])
+    return f"{plain(place, MAX_WORD)}: {plain(problem['msg'], 100)}"
 
 
 def named_twice(pairs: list[tuple[str, Any]]) -> str | None:
@@ -97,4 +91,4 @@ def named_twice(pairs: list[tuple[str, Any]]) -> str | None:
 
 def _refuse_twins(pairs: list[tuple[str, Any]]) -> None:
     if (name := named_twice(pairs)) is not None:
-        raise ValueError(f"'{printable(name)}' stands twice")
+        raise ValueError(f"'{plain(name, MAX_WORD)}' stands twice")

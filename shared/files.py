@@ -25,6 +25,7 @@ from functools import cache
 from pathlib import Path
 
 from shared.errors import MissingError, StoreError, UnreadableError, UsageError
+from shared.plain import plain
 
 TEMPORARY_PREFIX = ".tmp-"
 _PROCESS_NAME = re.compile(r"(?P<space>[^~/]*)~(?P<pid>\d{1,10})~(?P<start>\d{1,20})")
@@ -217,12 +218,6 @@ def _read_all(descriptor: int, limit: int, most: int) -> bytes:
     return b"".join(pieces)
 
 
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 @contextmanager
 def exclusive_lock(path: Path, wait_seconds: float = 0.0) -> Iterator[None]:
     """Hold a file's lock; the kernel gives it back when the holder dies, however it dies.
@@ -354,7 +349,7 @@ def _process_of(held: str) -> str:
 
 
 def _in_use(path: Path, held: str, otherwise: str = "") -> UsageError:
-    holder = "".join(filter(str.isprintable, (held.splitlines() or [""])[0])) or "unknown"
+    holder = plain((held.splitlines() or [""])[0]) or "unknown"
     return UsageError(f"{path.parent} is in use by process {holder}; wait for it or stop it{otherwise}")
 
 

@@ -74,15 +74,3 @@ def quaternion_from_rotation(rotation: Float) -> Float:
     )
     quaternion = np.linalg.eigh(k)[1][:, -1]
     return quaternion if quaternion[0] >= 0 else -quaternion
-
-
-def rotation_from_quaternion(quaternion: Float) -> Float:
-    """Rotation matrix [3, 3] of a quaternion (w, x, y, z) of any non-zero length."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

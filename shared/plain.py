@@ -11,12 +11,21 @@ _MARKS = re.compile(r"[\\`*\[\]|]")
 _FORMULA = ("=", "+", "-", "@")
 
 
-def plain(text: object) -> str:
+MAX_WORD = 80
+"""Characters of what a file says that a message repeats."""
+
+
+def plain(text: object, most: int | None = None) -> str:
     """One line for a terminal or a log: letters that show as themselves; all others are written as escapes.
 
     Control characters, line ends, overrides of the direction of writing and letters without width are such.
+
+    Args:
+        text: from outside.
+        most: characters of the result; None: all.
     """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text))
+    shown = str(text)[:most]
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in shown)[:most]
 
 
 def markdown(text: object) -> str:

@@ -11,7 +11,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from shared.configuration import StrictModel
-from shared.documents import parse_document, parse_object, printable
+from shared.documents import parse_document, parse_object
 from shared.errors import StoreError, UsageError
 from shared.methods import BaselineName, ModuleName
 from shared.networks.aap import Aap
@@ -20,6 +20,7 @@ from shared.networks.configuration import NetworkConfig
 from shared.networks.prior import Prior
 from shared.networks.where2act_adaptation import Where2ActAdaptation
 from shared.networks.where2act_interaction import Where2ActInteraction
+from shared.plain import MAX_WORD, plain
 
 WEIGHTS_FILE = "weights.safetensors"
 POLICY_FILE = "policy.json"
@@ -182,17 +183,17 @@ def read_tensors(data: bytes, expected: Mapping[str, Tensor], source: str) -> di
     odd = sorted((header.keys() - {METADATA}) ^ expected.keys())
     if odd:
         state = "missing" if odd[0] in expected else "unknown"
-        raise StoreError(f"{source}: tensor '{printable(odd[0])}' is {state}; the weights are of another network")
+        raise StoreError(f"{source}: tensor '{plain(odd[0], MAX_WORD)}' is {state}; the weights are of another network")
     for name, want in expected.items():
         entry = header[name] if isinstance(header[name], dict) else {}
         kinds = (_KINDS[want.dtype], "F16") if want.is_floating_point() else (_KINDS[want.dtype],)
         if entry.get("dtype") not in kinds or entry.get("shape") != list(want.shape):
-            given = printable(f"{entry.get('dtype')} {entry.get('shape')}")
+            given = plain(f"{entry.get('dtype')} {entry.get('shape')}", MAX_WORD)
             raise StoreError(f"{source}: tensor '{name}' is {given}, needs {want.dtype} {tuple(want.shape)}")
     try:
         tensors = _widened(load(data))
     except (SafetensorError, ValueError, RuntimeError) as error:
-        line = printable(" ".join(str(error).split()), 100)
+        line = plain(" ".join(str(error).split()), 100)
         raise StoreError(f"{source}: not readable as safetensors ({line}); the file is damaged or foreign") from None
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):

@@ -14,13 +14,13 @@ from benchmarks.published import PublishedSettings, measure
 from benchmarks.script import run_script
 from cluster.benchmarks.dynamics import ALL, DynamicsTrial, by_category
 from cluster.benchmarks.fidelity import PairedTrial, compare, summarise
-from cluster.cells import finite
 from cluster.cli import run
 from cluster.commands.bench import keep
 from collector.catalogue import scan
 from collector.procedural import generate
 from shared.configuration import CameraConfig, CollectionConfig, Fidelity, Timing
 from shared.errors import UsageError
+from shared.formatting import finite
 from shared.plan import Plan, Setting
 from shared.vocabulary import Outcome, OutcomeKind
 
@@ -142,7 +142,6 @@ def test_no_shipped_package_finds_the_scripts() -> None:
     ("args", "expected"),
     [
         (["fidelty"], "fidelity, dynamics, collect, learner; given 'fidelty'"),
-        (["scale"], "scripts in the repository's benchmarks/"),
         ([], "given nothing"),
         (["fidelity", "--task", "pusk"], "unknown task 'pusk'; allowed: push"),
         (["fidelity", "--trials", "0"], "trials"),

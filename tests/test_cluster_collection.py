@@ -11,14 +11,15 @@ import pytest
 from cluster.campaign import Campaign, Crew
 from cluster.collection import collect
 from cluster.configuration import CampaignConfig
-from cluster.fleet import Fleet, SerialFleet, WorkerFactory
+from cluster.fleet import Fleet, SerialFleet
 from cluster.locking import only_driver
-from cluster.progress import LINE_EVERY_S, CollectionProgress
+from cluster.progress import CollectionProgress
 from cluster.run_folder import RunFolder
 from collector.guard import UnderWay
-from collector.receipt import Receipt
+from collector.receipt import Receipt, WorkerFactory
 from shared.errors import StoreError, UsageError, WorkerError
 from shared.plan import Job, Plan
+from shared.progress import LINE_EVERY_S
 from shared.store import Store, verify
 from shared.underway import Underway
 from tests.fabricate import fabricate_rollout, fabricate_setting

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from cluster.configuration import EXECUTION_SETTINGS, CampaignConfig, RolloutCounts
 from cluster.evaluation_settings import EvaluateSettings
 from cluster.run_folder import begin, find
-from cluster.settings import difference, early_flags, layered, parse_flags, preset_names
+from cluster.settings import early_flags, layered, parse_flags, preset_names
 from shared.errors import UsageError
+from shared.store.difference import differences
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ values = st.recursive(st.integers(0, 2), lambda inner: st.dictionaries(st.sample
 
 @given(st.dictionaries(st.sampled_from("abc"), values), st.dictionaries(st.sampled_from("abc"), values))
 def test_a_difference_is_found_if_there_is_one(before: dict[str, object], after: dict[str, object]) -> None:
-    assert (difference(before, after) is None) == (before == after)
+    assert (not list(differences(before, after))) == (before == after)
 
 
 def test_a_run_folder_remembers_its_configuration(tmp_path: Path) -> None:

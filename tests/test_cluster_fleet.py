@@ -6,7 +6,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
@@ -19,7 +19,7 @@ import pytest
 
 from cluster.blame import MAX_FAULTS, MAX_LOSSES
 from cluster.fleet import Fleet, SerialFleet
-from cluster.orders import Listed, Order
+from cluster.orders import PlannedJob
 from cluster.ray_fleet import RayFleet
 from cluster.seats import IN_FLIGHT
 from cluster.session import fleets, ray_session
@@ -59,6 +59,21 @@ def fleet(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
         found: Fleet = request.getfixturevalue("ray_fleet")
         return found
     return SerialFleet(partial(FakeWorker, tmp_path))
+
+
+class Listed:
+    """Jobs of one plan that are known beforehand."""
+
+    def __init__(self, plan: Plan, jobs: Sequence[Job]) -> None:
+        self._left = [PlannedJob(plan, job) for job in reversed(jobs)]
+        self.any_done = False
+
+    @property
+    def ended(self) -> bool:
+        return not self._left
+
+    def take(self) -> PlannedJob | None:
+        return self._left.pop() if self._left else None
 
 
 def plan(proposer: str = "random", version: int = 0) -> Plan:
@@ -126,7 +141,7 @@ class Slow(Listed):
         self.asked = 0
         self.taken = 0
 
-    def take(self) -> Order | None:
+    def take(self) -> PlannedJob | None:
         self.asked += 1
         if self.asked % 2:
             return None

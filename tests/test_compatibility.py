@@ -268,7 +268,7 @@ def older(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         manifest["points"] = manifest.pop("cloud_size")
         return files | {"rollouts.parquet": sink.getvalue().to_pybytes()}, manifest
 
-    monkeypatch.setitem(migration.STEPS, 0, migration.Step(lambda _, content: content, shard))
+    monkeypatch.setitem(migration.STEPS, 0, migration.MigrationStep(lambda _, content: content, shard))
     yield
 
 

@@ -16,7 +16,7 @@ from cluster.cli import run as adaafford
 from cluster.evaluation import PROPOSER, Evaluation
 from cluster.evaluation_of_run import evaluate_run
 from cluster.evaluation_settings import EvaluateSettings
-from cluster.evaluation_tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, Table, as_csv, as_markdown
+from cluster.evaluation_tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
 from cluster.judging import judge
 from collector.procedural.writing import generate
 from collector.worker import Worker
@@ -24,6 +24,7 @@ from learner.bootstrap import ratio_interval
 from learner.evaluation import EvaluationRow, ObjectCounts
 from learner.metrics import f_score
 from shared.errors import UsageError
+from shared.formatting import csv_table
 from shared.methods import METHODS
 from shared.plan import EvaluationConfig, Plan, Setting
 from shared.store import Store
@@ -68,21 +69,21 @@ def test_one_object_says_nothing_of_others() -> None:
     assert np.isnan(ratio_interval([], [], [])).all()
 
 
-def table_of(**values: object) -> Table:
+def table_of(**values: object) -> EvaluationTable:
     row = {
         **{"method": "ours-final", "budget": 2, "f_score": 0.5, "f_score_low": 0.25, "f_score_high": 0.75},
         **{"sample_success": None, "sample_success_low": None, "sample_success_high": None, "trials": 0},
         **{"start_success": 0.4, "start_success_low": 0.2, "start_success_high": 0.6, "counts": {"object": ["a"]}},
         **{"best_f": 0.6, "bce": 0.5, "auc": None, "base_rate": 0.3, "mean_tries": 2.0, "gap_closed": None},
     }
-    return Table("push-faucet", 1, 4, 40, 2, "ab" * 32, {"a": "cd" * 32}, (row | values,))
+    return EvaluationTable("push-faucet", 1, 4, 40, 2, "ab" * 32, {"a": "cd" * 32}, (row | values,))
 
 
 def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     shown = as_markdown(table_of())
     assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | 40.0 [20.0, 60.0] | - | 0 |" in shown
     assert "30.0% succeed" in shown
-    read = list(csv.DictReader(io.StringIO(as_csv(table_of().rows))))
+    read = list(csv.DictReader(io.StringIO(csv_table(table_of().rows, ["counts"]))))
     assert (read[0]["f_score"], read[0]["auc"]) == ("0.5", "")
     assert "counts" not in read[0]
 

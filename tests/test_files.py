@@ -74,11 +74,6 @@ def test_reading_refuses_what_is_no_file(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_sha256_of_a_known_file(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(b"abc")
-    assert files.sha256_of(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-
-
 def test_a_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
     path = tmp_path / "lock"
     code = "import sys, time, pathlib; from shared.files import exclusive_lock\n"

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from collector.articulation import joint_motion
 from shared.geometry import (
     camera_pose,
     gripper_rotation,
     quaternion_from_rotation,
-    rotation_from_quaternion,
     view_from_world,
 )
 from shared.plan import covered, missing_jobs
@@ -52,7 +52,7 @@ def test_gripper_rotations_are_rotations_along_the_approach(approach: tuple, rol
     assert np.linalg.det(rotation) == pytest.approx(1)
     assert rotation[:, 2] == pytest.approx(up)
     assert rotation[:, 0] @ np.array(roll) > 0
-    again = rotation_from_quaternion(quaternion_from_rotation(rotation))
+    again = Rotation.from_quat(quaternion_from_rotation(rotation), scalar_first=True).as_matrix()
     assert again == pytest.approx(rotation, abs=1e-9)
 
 

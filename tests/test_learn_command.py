@@ -12,10 +12,9 @@ from cluster.cli import run
 from cluster.locking import only_driver
 from cluster.training import as_toml
 from learner.alternation import alternate
-from learner.configuration import AlternationConfig
+from learner.configuration import PUBLISHED_FILE, AlternationConfig
 from learner.data import kept_for_validation, load_dataset, split
 from learner.following import Following, Pace, publish
-from learner.names import PUBLISHED_FILE
 from learner.stages import DONE_FILE, StageJob
 from shared.errors import StoreError
 from shared.plan import Job, Plan

@@ -18,14 +18,21 @@ from learner.affordance import AapCritic, AffordanceStage, AipCritic, Critic, Pr
 from learner.aip import AipStage
 from learner.checkpoint import Cursor
 from learner.comparison import curve_rows, rows_of
-from learner.configuration import AapConfig, AffordanceConfig, AipConfig, LearnerConfig, PriorConfig, TrainingConfig
+from learner.configuration import (
+    METRICS_FILE,
+    AapConfig,
+    AffordanceConfig,
+    AipConfig,
+    LearnerConfig,
+    PriorConfig,
+    TrainingConfig,
+)
 from learner.curve import Answers, Asked, Candidates, answer, proposal_gains, tries_by_aip
 from learner.data import Dataset, Split, load_dataset
 from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
 from learner.features import MOST_ENCODERS, FrozenFeatures, ProposalPool, frozen_features
 from learner.frozen import FrozenAap
 from learner.information import tries_by_information
-from learner.names import METRICS_FILE
 from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
 from learner.sampling import Batch, order_rows

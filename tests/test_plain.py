@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.cli import run as adaafford
-from cluster.evaluation_tables import as_csv
 from cluster.logs import JsonLines, Lines
+from shared.formatting import csv_table
 from shared.plain import csv_cell, markdown, plain
 
 HOSTILE = "a\x1b]0;x\x07\r\nforged\u202etxt\u200b|<img src=x onerror=y>[red]`=1+1"
@@ -31,7 +31,7 @@ def test_markdown_has_neither_html_nor_the_end_of_a_cell(text: str) -> None:
 
 @pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@sum", " =1", "\t=1", "\r=1"])
 def test_a_spreadsheet_takes_no_text_for_a_formula(text: str) -> None:
-    ((cell,),) = list(csv.reader(io.StringIO(as_csv([{"name": text}]))))[1:]
+    ((cell,),) = list(csv.reader(io.StringIO(csv_table([{"name": text}]))))[1:]
     assert cell[0] not in "=+-@\t\r " or cell.startswith("\\")
     assert csv_cell(-1.5) == -1.5
     assert csv_cell("ours-final") == "ours-final"

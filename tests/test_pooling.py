@@ -67,9 +67,10 @@ def make_results(folder: Path, seed: int, contents: dict[str, str], task: str) -
     rng = np.random.default_rng(seed)
     counts = {method: counts_of(rng, tuple(contents)) for method, _ in METHODS}
     figures = {"best_f": 0.5, "bce": 0.4, "auc": None, "base_rate": 0.25 + 0.1 * seed, "mean_tries": 1.0}
+    figures |= {"f_score": 0.5, "sample_success": None, "trials": 3, "queries": 15}
     rows = [{"method": m, "budget": b, "counts": counts[m], **figures} for m, b in METHODS]
     known = contents | {"untried": "7" * 64}
-    document = {"task": task, "seed": seed, "rollouts": 10, "contents": known, "rows": rows}
+    document = {"task": task, "seed": seed, "objects": len(contents), "rollouts": 10, "contents": known, "rows": rows}
     folder.mkdir(parents=True)
     (folder / RESULTS_FILE).write_text(json.dumps(document))
     return counts  # type: ignore[return-value]

@@ -10,7 +10,7 @@ from collector import procedural
 from collector.articulation import ArticulatedObject, Mesh
 from collector.catalogue import qualifying_parts, scan
 from collector.partnet import read_object
-from collector.procedural.assembly import GRID, Assembly, normalised
+from collector.procedural.assembly import GRID, ProceduralObject, normalised
 from collector.procedural.cabinets import storage_furniture
 from collector.procedural.writing import object_files, write_object
 from shared.errors import UsageError
@@ -222,7 +222,7 @@ def test_the_ambiguous_tasks_find_their_parts(made: Path) -> None:
 
 
 def test_normalising_keeps_the_shape() -> None:
-    before: Assembly = storage_furniture("left")
+    before: ProceduralObject = storage_furniture("left")
     after = normalised(before)
     sizes = [[np.ptp(piece.vertices, axis=0) for piece in a.body] for a in (before, after)]
     ratios = np.array(sizes[1]) / np.array(sizes[0])

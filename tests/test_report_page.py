@@ -19,14 +19,15 @@ import pytest
 from cluster.cli import run as run_command
 from cluster.configuration import CampaignConfig
 from cluster.episodes import Episode, first_episodes, most_telling
+from cluster.evaluation_tables import ResultRow
 from cluster.ledger import Ledger
-from cluster.reporting.clouds import TANGENT, Panel, draw_panels, tried
+from cluster.reporting.clouds import TANGENT, CloudView, draw_panels, tried
 from cluster.reporting.collecting import wilson
-from cluster.reporting.failures import Failure, varied
+from cluster.reporting.failures import FailedExploit, varied
 from cluster.reporting.laboratory import Laboratory, hinge_twins, variations
 from cluster.reporting.page import MAX_TEXT, Drawing, Page, Section, plain, render, shortened
 from cluster.reporting.published import published
-from cluster.reporting.results import ResultRow, Results, table_of
+from cluster.reporting.results import Results, table_of
 from cluster.reporting.training import after_tries, curves_of, read_entries
 from cluster.run_folder import ObjectsUsed, RunFolder, begin
 from shared.adaptation import Adapter
@@ -267,7 +268,7 @@ def test_a_browser_draws_every_figure_and_obeys_no_text(run: RunFolder, html: st
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
 def test_in_a_browser_tabs_change_the_figure_and_its_clouds_turn_together(tmp_path: Path) -> None:
-    panel = Panel("a", observation_of(), np.zeros(200, np.float32))
+    panel = CloudView("a", observation_of(), np.zeros(200, np.float32))
     drawings = [Drawing(draw_panels([panel] * 3, 3, ("a",)), tab=name, solid=True) for name in ("one", "two")]
     page = render(Page("a", "b", (), (Section("s", "t", drawings=tuple(drawings)),)))
     # The visitor is a script, which the page's policy would not let in.
@@ -399,7 +400,7 @@ def test_clouds_of_a_figure_share_frame_and_eye_and_none_is_cut_off() -> None:
     for seed in range(3):
         observation = observation_of(seed)
         arrows = tuple(tried(interaction) for interaction in history_of(observation, 2, seed))
-        panels.append(Panel("a", observation, np.linspace(0, 1, 200, dtype=np.float32), arrows))
+        panels.append(CloudView("a", observation, np.linspace(0, 1, 200, dtype=np.float32), arrows))
     figure = draw_panels(panels, 3, ("affordance",))
     scenes = list(figure.select_scenes())
     assert len(scenes) == 3
@@ -422,7 +423,7 @@ def test_clouds_of_a_figure_share_frame_and_eye_and_none_is_cut_off() -> None:
 def test_an_arrow_ends_where_the_gripper_touches() -> None:
     observation = observation_of()
     interaction = history_of(observation, 1)[0]
-    figure = draw_panels([Panel("a", observation, np.zeros(200, np.float32), (tried(interaction),))], 1, ("a",))
+    figure = draw_panels([CloudView("a", observation, np.zeros(200, np.float32), (tried(interaction),))], 1, ("a",))
     cone = next(trace for trace in figure.data if trace.type == "cone")
     assert (cone.x[0], cone.y[0], cone.z[0]) == tuple(interaction.action.point)
     assert (cone.u[0], cone.v[0], cone.w[0]) == tuple(interaction.action.approach)
@@ -454,10 +455,10 @@ def test_failures_come_one_of_a_kind_first_and_the_most_believed_before_others(r
     assert shown == [(kinds[0], 0.9), (kinds[4], 0.2), (kinds[3], 0.1), (kinds[1], 0.8)]
 
 
-def failure_of(episode: Episode, kind: OutcomeKind, belief: float) -> Failure:
+def failure_of(episode: Episode, kind: OutcomeKind, belief: float) -> FailedExploit:
     row = episode.exploits[-1]
     outcome = dataclasses.replace(row.outcome, kind=kind, success=False)
-    return Failure(episode, dataclasses.replace(row, outcome=outcome), belief)
+    return FailedExploit(episode, dataclasses.replace(row, outcome=outcome), belief)
 
 
 # Hidden facts

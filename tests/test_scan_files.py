@@ -621,7 +621,7 @@ def test_a_history_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
         (HISTORY.encode().replace(b"0.21", b"1" * 5000), "number out of range"),
         (HISTORY.encode().replace(b"0.21", b'{"a":' * 5000), "Invalid JSON"),
         (HISTORY.encode().replace(b"scan-1", b"a\\u001b[31m\\n"), "needs a name without control characters"),
-        (HISTORY.encode().replace(b'"up"', b'"u\\n\\u001bp"'), "frame.u??p: Extra inputs"),
+        (HISTORY.encode().replace(b'"up"', b'"u\\n\\u001bp"'), r"frame.u\n\x1bp: Extra inputs"),
         (HISTORY.encode().replace(b"scan-1", b"\xff"), "Invalid JSON"),
     ],
 )

@@ -112,8 +112,8 @@ def test_lost_cut_and_foreign_files_are_found(store: Store, shard: Path) -> None
     (store.path / "notes.txt").write_bytes(b"x")
     (store.shards_folder / "backup").mkdir()
     (store.path / "plans" / "aip-v2.json").write_bytes(canonical(PLAN.model_dump(mode="json")))
-    (store.policies_folder / "000001" / "extra").write_bytes(b"x")
-    (store.policies_folder / "latest").mkdir()
+    (store.path / "policies" / "000001" / "extra").write_bytes(b"x")
+    (store.path / "policies" / "latest").mkdir()
     assert sorted(problem.where for problem in verify(store)) == sorted(
         [
             f"{inside}/rollouts.parquet",
@@ -430,7 +430,7 @@ def test_links_are_not_followed(store: Store, shard: Path, tmp_path: Path) -> No
 
 
 def test_a_hostile_policy_is_refused(store: Store) -> None:
-    folder = store.policies_folder / "000001"
+    folder = store.path / "policies" / "000001"
     index = unseal((folder / "index.json").read_bytes(), "index")
     entry = index["files"]["policy.json"]
     for files in ({"../../store.json": entry}, {"policy.json": entry | {"size": 2**40}}, {"policy.json": {"size": 2}}):

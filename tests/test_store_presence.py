@@ -16,8 +16,8 @@ import pytest
 from cluster.cli import run
 from cluster.collection import Newest, collect
 from cluster.status import DriverStatus
+from learner.configuration import PUBLISHED_FILE
 from learner.following import publish
-from learner.names import PUBLISHED_FILE
 from shared import files
 from shared.errors import UsageError
 from shared.files import is_gone, process_name

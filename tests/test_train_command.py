@@ -23,17 +23,16 @@ from cluster.children import OUTPUT_FILE, Learner
 from cluster.cli import INTERRUPTED, run
 from cluster.training import as_toml
 from learner.alternation import ALTERNATION_FILE, alternate, converged
-from learner.configuration import AlternationConfig, LearnerConfig
+from learner.configuration import METRICS_FILE, AlternationConfig, LearnerConfig
 from learner.data import load_dataset, split, without_later
 from learner.hardware import Hardware
-from learner.names import METRICS_FILE
-from learner.progress import ProgressReport, Standing
 from learner.stages import DONE_FILE, LOCK_FILE, StageJob, read_policy_folder, run_stage
 from learner.training import CHECKPOINT_FILE
 from shared.errors import UsageError, WorkerError
 from shared.files import exclusive_lock
 from shared.plan import Job
 from shared.policy import POLICY_FILE, WEIGHTS_FILE
+from shared.progress import Progress
 from shared.redaction import without_places
 from shared.store.store import Store
 from tests.test_learner_data import fabricated_plan, fabricated_rollouts, make_store
@@ -218,14 +217,14 @@ def damaged_checkpoint(path: Path, kind: str) -> None:
 def stopped(store: Path, config_file: Path) -> Path:
     """A folder of a stage that was stopped after some steps."""
 
-    def stop(report: ProgressReport, standing: Standing) -> None:
-        if standing.step == 3:
+    def stop(progress: Progress, done: int, most_left_s: float) -> None:
+        if done == 3:
             raise KeyboardInterrupt
 
     out = store.parent / "stopped"
     arguments = ["--store", str(store), "--out", str(out), "--config", str(config_file)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ProgressReport, "update", stop)
+        patch.setattr(Progress, "show", stop)
         assert run(["train", "prior", *arguments]) == INTERRUPTED
     assert (out / CHECKPOINT_FILE).exists()
     return out

@@ -12,7 +12,7 @@ from collector.clock import StageClock
 from collector.environment import SapienEnvironment
 from collector.partnet import read_object
 from collector.procedural import build
-from collector.procedural.assembly import Assembly, normalised
+from collector.procedural.assembly import ProceduralObject, normalised
 from collector.procedural.cabinets import storage_furniture
 from collector.procedural.writing import write_object
 from collector.proposers import RandomProposer
@@ -109,7 +109,7 @@ def faucets(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     ]
 
 
-def reversed_switches(made: Assembly) -> Assembly:
+def reversed_switches(made: ProceduralObject) -> ProceduralObject:
     """The assembly with every switch's axis turned round."""
     parts = (
         replace(part, axis=(-part.axis[0], -part.axis[1], -part.axis[2])) if part.name == "switch" else part

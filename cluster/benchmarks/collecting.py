@@ -10,11 +10,11 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cluster.benchmarks.progress import Advance
 from cluster.progress import Tally
 from collector.worker import Worker
 from shared.errors import UsageError
 from shared.plan import ROLLOUTS_PER_SHARD, Plan, missing_jobs
+from shared.progress import Advance
 from shared.store import Store, info
 
 STAGES = ("load", "settle", "observe", "propose", "simulate", "write")

@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from cluster.benchmarks.progress import Advance
 from collector.articulation import ArticulatedObject
 from collector.catalogue import load_ref
 from collector.clock import StageClock
 from collector.draws import draw_dynamics, draw_rollout, object_of
 from collector.environment import SAME_STATE, SapienEnvironment
-from collector.primitives import Trial
-from collector.proposers import RandomProposer
+from collector.proposers import RandomProposer, RepeatingProposer
+from collector.recorder import interact
 from collector.rollout import make_environment
 from shared import seeds
 from shared.plan import Plan
+from shared.progress import Advance
 from shared.tasks import task_named
-from shared.vocabulary import Action, Float, HiddenDynamics, Observation, OutcomeKind
+from shared.vocabulary import Action, Float, HiddenDynamics, OutcomeKind
 
 ALL = "all"
 
@@ -132,7 +132,6 @@ class _State:
     """A state in which the object has come to rest, and what is tried from it."""
 
     positions: Float
-    observation: Observation
     actions: tuple[Action, ...]
 
 
@@ -153,13 +152,9 @@ def _rollout(plan: Plan, target: ArticulatedObject, index: int, draws: int, acti
         if place is None:
             continue
         state = states[place]
-        for number, action in enumerate(state.actions):
-            environment.scene.put(state.positions)
-            part = int(state.observation.part_ids[action.point_index])
-            outcome = Trial(environment.scene, action, part, environment.primitive, setting.collection.fidelity).run()
-            yield DynamicsTrial(target.ref.category, (index, place, number), outcome.kind, outcome.success)
-            if outcome.kind is OutcomeKind.UNSTABLE:
-                break  # Nothing that this scene says later could be believed.
+        proposer, most = RepeatingProposer(state.actions), len(state.actions)
+        for number, tried in enumerate(interact(environment, proposer, most, start=state.positions)):
+            yield DynamicsTrial(target.ref.category, (index, place, number), tried.outcome.kind, tried.outcome.success)
 
 
 def _environment(plan: Plan, target: ArticulatedObject, index: int, dynamics: HiddenDynamics) -> SapienEnvironment:
@@ -182,5 +177,5 @@ def _place_of(
         return None
     observation = environment.observe()
     proposed = (proposer.propose(observation, ()) for _ in range(actions))
-    states.append(_State(positions, observation, tuple(action for action in proposed if action is not None)))
+    states.append(_State(positions, tuple(action for action in proposed if action is not None)))
     return len(states) - 1

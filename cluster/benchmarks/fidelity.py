@@ -9,19 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from cluster.benchmarks.progress import Advance
 from collector.catalogue import load_ref
 from collector.clock import StageClock
 from collector.draws import draw_rollout, object_of
 from collector.environment import SapienEnvironment
 from collector.primitives import MOTION_THRESHOLD, Trial
 from collector.proposers import RandomProposer
+from collector.recorder import interact
 from collector.rollout import make_environment
 from shared import seeds
 from shared.configuration import Fidelity
 from shared.errors import UsageError
 from shared.plan import Plan
-from shared.vocabulary import Action, Float, Observation, Outcome, OutcomeKind
+from shared.progress import Advance
+from shared.vocabulary import Action, Observation, Outcome, OutcomeKind
 
 STATES, ACTIONS = 2, 4
 """Of each rollout: states drawn, and actions tried from each. Few, so that the trials spread over many objects."""
@@ -167,30 +168,29 @@ def _rollout(reference: Plan, candidate: Plan, folder: Path, index: int) -> Iter
     proposer = RandomProposer(seeds.generator(seed, f"actions/{key}", index), candidate.setting.terms.edge_share)
     # Both draw the same states from streams of their own, so that both learn the same hidden direction mode.
     streams = [seeds.generator(seed, f"states/{key}", index, 0) for _ in range(2)]
+    pair: PairedTrial
+
+    def execute_both(observation: Observation, action: Action) -> Outcome:
+        nonlocal pair
+        part = int(observation.part_ids[action.point_index])
+        truth.restore(judged.state())
+        expected, expected_s = _execute(truth, reference, action, part)
+        got, got_s = _execute(judged, candidate, action, part)
+        pair = PairedTrial(target.ref.id, expected, got, expected_s, got_s)
+        return got
+
     for _ in range(STATES):
         truth.reset(streams[0])
         if not (judged.reset(streams[1]) and judged.shows_a_target()):
             continue
-        observation, positions = judged.observe(), judged.state()
-        for _ in range(ACTIONS):
-            action = proposer.propose(observation, ())
-            assert action is not None, "the observation shows a target"
-            outcomes = [
-                _try(environment, plan.setting.collection.fidelity, positions, observation, action)
-                for environment, plan in ((truth, reference), (judged, candidate))
-            ]
-            (expected, expected_s), (got, got_s) = outcomes
-            yield PairedTrial(target.ref.id, expected, got, expected_s, got_s)
-            if OutcomeKind.UNSTABLE in (expected.kind, got.kind):
-                return  # Nothing that these scenes say later could be believed.
+        for _ in interact(judged, proposer, ACTIONS, start=judged.state(), execute=execute_both):
+            yield pair
+            if OutcomeKind.UNSTABLE in (pair.reference.kind, pair.candidate.kind):
+                return  # Nothing that these scenes show later can be believed.
 
 
-def _try(
-    environment: SapienEnvironment, fidelity: Fidelity, positions: Float, observation: Observation, action: Action
-) -> tuple[Outcome, float]:
+def _execute(environment: SapienEnvironment, plan: Plan, action: Action, part: int) -> tuple[Outcome, float]:
     """An outcome, and the CPU seconds that it took."""
-    environment.scene.put(positions)
     begun = time.process_time()
-    part = int(observation.part_ids[action.point_index])
-    outcome = Trial(environment.scene, action, part, environment.primitive, fidelity).run()
+    outcome = Trial(environment.scene, action, part, environment.primitive, plan.setting.collection.fidelity).run()
     return outcome, time.process_time() - begun

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from cluster.benchmarks.progress import Advance
 from learner.aap import AapStage, OracleStage
 from learner.aip import AipStage
 from learner.configuration import LearnerConfig, TrainingConfig
@@ -20,6 +19,7 @@ from learner.oracle import OracleCritic, Teacher
 from learner.prior import PriorStage
 from learner.training import Stage, train
 from shared.policy import Policy
+from shared.progress import Advance
 from shared.store import Store
 
 NETWORKS = ("prior", "aap", "oracle", "aap-from-oracle", "aip")

@@ -10,20 +10,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import make_dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from pydantic import Field
 
-from cluster.benchmarks.progress import progress
-from cluster.cells import finite
 from cluster.selection import ObjectSelection
-from cluster.settings import parse_flags
+from cluster.settings import dispatch
 from shared.configuration import FIDELITIES, CollectionConfig, Fidelity
 from shared.errors import UsageError
 from shared.files import write_atomically
+from shared.formatting import finite
+from shared.progress import Progress
 from shared.tasks import task_named
 from shared.vocabulary import Primitive
 
@@ -115,46 +116,33 @@ class LearnerSettings(StoredSettings):
     """Rollouts a step of AAP and AIP; unset: what training uses."""
 
 
-Settings = TypeVar("Settings", bound=BenchSettings)
-
-
 def main(args: list[str]) -> int:
     """Run one of the benchmarks."""
-    if args[:1] in (["-h"], ["--help"]):
-        print(f"usage: adaafford bench {{{','.join(BENCHMARKS)}}}; `adaafford bench fidelity --help` tells more")
-        return 0
-    if not args or args[0] not in BENCHMARKS:
-        given = f"'{args[0]}'" if args else "nothing"
-        more = "others are scripts in the repository's benchmarks/"
-        raise UsageError(f"bench needs one of {', '.join(BENCHMARKS)}; given {given}; {more}")
-    return run_benchmark(args[0], *BENCHMARKS[args[0]], args[1:])
+    actions = {
+        name: (flags_of(kind), partial(run_benchmark, name, measure)) for name, (kind, measure) in BENCHMARKS.items()
+    }
+    return dispatch("bench", actions, args, "[FLAGS]")
 
 
-def run_benchmark(
-    name: str,
-    settings: type[Settings],
-    measure: Callable[[Settings], dict[str, Any]],
-    args: list[str],
-    program: str = "adaafford bench ",
-) -> int:
-    """Parse flags, measure, keep and print.
+def flags_of(settings: type[BenchSettings]) -> type[Any]:
+    """What declares the flags of a benchmark with these settings; their docstring describes it."""
+    field = "settings", Annotated[settings, tyro.conf.arg(name="")], settings()
+    flags = make_dataclass(settings.__name__, [field], frozen=True)
+    flags.__doc__ = settings.__doc__
+    return flags
+
+
+def run_benchmark(name: str, measure: Callable[[Any], dict[str, Any]], flags: Any) -> int:
+    """Measure, keep and print.
 
     Args:
         name: of the benchmark.
-        settings: declares its flags; its docstring is the description.
         measure: prints a table and returns the result as JSON can hold it.
-        args: what was given.
-        program: what stands before the name in the usage text.
+        flags: of a class that `flags_of` made.
     """
     from cluster.session import without_foreign_settings
 
-    flags: Any = make_dataclass(
-        "Flags",
-        [("settings", Annotated[settings, tyro.conf.arg(name="")], settings())],
-        frozen=True,  # type: ignore[valid-type]
-    )
-    flags.__doc__ = settings.__doc__
-    command: Settings = parse_flags(flags, args, name, program=program).settings
+    command: BenchSettings = flags.settings
     # Some import Ray, which reads its settings then, before they start a session.
     with without_foreign_settings():
         result = measure(command)
@@ -173,8 +161,8 @@ def run_benchmark(
 def _fidelity(command: FidelitySettings) -> dict[str, Any]:
     from cluster.benchmarks.fidelity import compare
 
-    with planned(command) as (plan, folder), progress(f"trials, {command.task}", command.trials) as advance:
-        result = compare(plan, folder, command.reference, command.candidate, command.trials, advance)
+    with planned(command) as (plan, folder), Progress(f"trials, {command.task}", command.trials) as progress:
+        result = compare(plan, folder, command.reference, command.candidate, command.trials, progress.advance)
     print(f"{result.trials} trials on {result.objects} objects, {result.positives} positives in the reference")
     print(f"  label agreement   {result.label_agreement:.1%}")
     print(f"  F1 of positives   {result.positive_f1:.3f}")
@@ -191,8 +179,8 @@ def _fidelity(command: FidelitySettings) -> dict[str, Any]:
 def _dynamics(command: DynamicsSettings) -> dict[str, Any]:
     from cluster.benchmarks.dynamics import ALL, measure
 
-    with planned(command) as (plan, folder), progress(f"rollouts, {command.task}", command.rollouts) as advance:
-        found = measure(plan, folder, command.rollouts, command.draws, command.actions, advance)
+    with planned(command) as (plan, folder), Progress(f"rollouts, {command.task}", command.rollouts) as progress:
+        found = measure(plan, folder, command.rollouts, command.draws, command.actions, progress.advance)
     print(f"{'category':<18}{'trials':>7}{'success':>9}{'pairs':>7}{'ever':>6}{'depends on draw':>17}  outcomes")
     for name, figures in found.items():
         outcomes = ", ".join(f"{kind} {share:.0%}" for kind, share in figures.outcomes.items())
@@ -214,16 +202,16 @@ def _collect(command: CollectSettings) -> dict[str, Any]:
 
     with planned(command) as (plan, folder):
         runs = []
-        with progress(f"jobs, {command.task}", command.repeats * jobs_of(command.rollouts)) as advance:
+        with Progress(f"jobs, {command.task}", command.repeats * jobs_of(command.rollouts)) as progress:
             for _ in range(command.repeats):
                 with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
                     store = Store.create(Path(scratch) / "store", plan.setting)
-                    runs.append(collect(plan, folder, command.rollouts, store, advance))
+                    runs.append(collect(plan, folder, command.rollouts, store, progress.advance))
         result = summary(runs)
         print_collection(result)
         if command.workers > 1:
-            with progress(f"turns of 1 and {command.workers} workers", 2 * command.repeats + 2) as advance:
-                result |= speedup(plan, folder, command.rollouts, command.repeats, command.workers, advance)
+            with Progress(f"turns of 1 and {command.workers} workers", 2 * command.repeats + 2) as progress:
+                result |= speedup(plan, folder, command.rollouts, command.repeats, command.workers, progress.advance)
             same = "the same content" if result["same_digest"] else "OTHER CONTENT"
             print(
                 f"{result['workers']} workers                       {result['workers_speedup']:.2f} times one; {same}"
@@ -255,8 +243,8 @@ def _learner(command: LearnerSettings) -> dict[str, Any]:
         config = config.model_copy(update={"aap": aap, "aip": config.aip.model_copy(update=batch)})
     with stored(command) as store, hardware(config) as found:
         benchmark = LearningBenchmark(store, config, found, command.repeats, command.steps)
-        with progress("turns of training", benchmark.turns) as advance:
-            benchmark.run(advance)
+        with Progress("turns of training", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
         result = benchmark.as_json() | source_of(command, store) | {"batch_rollouts": config.aap.batch_rollouts}
     print(f"{command.repeats} times {command.steps} steps; medians, interactions a second")
     for name in NETWORKS:
@@ -265,7 +253,7 @@ def _learner(command: LearnerSettings) -> dict[str, Any]:
     return result
 
 
-BENCHMARKS: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
+BENCHMARKS: dict[str, tuple[type[BenchSettings], Callable[[Any], dict[str, Any]]]] = {
     "fidelity": (FidelitySettings, _fidelity),
     "dynamics": (DynamicsSettings, _dynamics),
     "collect": (CollectSettings, _collect),
@@ -306,8 +294,8 @@ def stored(command: StoredSettings) -> Iterator["Store"]:
 
     with planned(command) as (plan, folder), TemporaryDirectory(prefix="adaafford-bench-") as scratch:
         store = Store.create(Path(scratch) / "store", plan.setting)
-        with progress(f"jobs of collection, {command.task}", jobs_of(command.rollouts)) as advance:
-            collect(plan, folder, command.rollouts, store, advance)
+        with Progress(f"jobs of collection, {command.task}", jobs_of(command.rollouts)) as progress:
+            collect(plan, folder, command.rollouts, store, progress.advance)
         yield store
 
 

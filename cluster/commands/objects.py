@@ -7,17 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from pydantic import Field
 
-from cluster.settings import parse_flags
+from cluster.settings import Action, dispatch
 from shared.errors import UsageError
 from shared.plain import plain
 from shared.vocabulary import Primitive
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from collector.catalogue import CatalogueEntry
-
-ACTIONS = ("generate", "check", "preview", "film", "decompose")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,26 +78,6 @@ class DecomposeCommand:
 
     path: Annotated[Path, tyro.conf.Positional]
     """A folder of objects, or one object's folder."""
-
-
-def main(args: list[str]) -> int:
-    """Dispatch."""
-    match args[:1]:
-        case ["generate"]:
-            return _generate(parse_flags(GenerateCommand, args[1:], "objects generate"))
-        case ["check"]:
-            return _check(parse_flags(CheckCommand, args[1:], "objects check"))
-        case ["preview"]:
-            return _preview(parse_flags(PreviewCommand, args[1:], "objects preview"))
-        case ["film"]:
-            return _film(parse_flags(FilmCommand, args[1:], "objects film"))
-        case ["decompose"]:
-            return _decompose(parse_flags(DecomposeCommand, args[1:], "objects decompose"))
-        case ["-h" | "--help"]:
-            print(f"usage: adaafford objects {{{','.join(ACTIONS)}}} PATH; `adaafford objects check --help` tells more")
-            return 0
-    given = f"'{args[0]}'" if args else "nothing"
-    raise UsageError(f"objects needs one of {', '.join(ACTIONS)}; given {given}")
 
 
 def _generate(command: GenerateCommand) -> int:
@@ -180,38 +156,42 @@ def _film(command: FilmCommand) -> int:
 
 
 def _decompose(command: DecomposeCommand) -> int:
-    from rich.progress import Progress, TaskID
-
     from collector.catalogue import load, scan
     from collector.decomposition import Decomposer
     from shared.errors import ObjectError
     from shared.private import cache_folder
+    from shared.progress import Progress
 
     usable, failed = scan(command.path).usable, 0
-    with Decomposer(cache_folder("pieces")) as decomposer, Progress(transient=True) as bar:
+    with Decomposer(cache_folder("pieces")) as decomposer:
         for number, entry in enumerate(usable, start=1):
-            task = bar.add_task(f"{entry.ref.id} ({number} of {len(usable)})", total=None)
-
-            def show(done: int, total: int, task: TaskID = task) -> None:
-                bar.update(task, completed=done, total=total)
-
             try:
                 target = load(entry)
-                opened = decomposer.decomposed(target, show)
+                with Progress(f"{entry.ref.id} ({number} of {len(usable)}), meshes") as progress:
+                    opened = decomposer.decomposed(target, progress.show)
             except ObjectError as error:
                 failed += 1
-                _say(bar.console, f"{entry.ref.id}  refused: {error}")
+                print(plain(f"{entry.ref.id}  refused: {error}"))
             else:
                 meshes, pieces = (sum(len(body.collisions) for body in o.bodies) for o in (target, opened))
-                _say(bar.console, f"{entry.ref.id}  {meshes} meshes, {pieces} convex pieces")
-            bar.remove_task(task)
+                print(plain(f"{entry.ref.id}  {meshes} meshes, {pieces} convex pieces"))
     print(f"{len(usable) - failed} decomposed into {cache_folder('pieces')}, {failed} refused")
     return 0 if failed < len(usable) else UsageError.exit_code
 
 
-def _say(console: "Console", line: str) -> None:
-    console.print(plain(line), markup=False, highlight=False, soft_wrap=True)
-
-
 def _parts(count: int) -> str:
     return f"{count} movable part{'' if count == 1 else 's'}"
+
+
+ACTIONS: dict[str, Action] = {
+    "generate": (GenerateCommand, _generate),
+    "check": (CheckCommand, _check),
+    "preview": (PreviewCommand, _preview),
+    "film": (FilmCommand, _film),
+    "decompose": (DecomposeCommand, _decompose),
+}
+
+
+def main(args: list[str]) -> int:
+    """Run one of the actions."""
+    return dispatch("objects", ACTIONS, args, "PATH")

@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cluster.cells import finite
-from cluster.settings import parse_flags
+from cluster.commands import upkeep
+from cluster.settings import Action, dispatch
 from shared.errors import UsageError
+from shared.formatting import finite
 from shared.plain import plain
+from shared.progress import Progress
 
 if TYPE_CHECKING:
     from cluster.resimulation import Divergence
     from shared.records import RolloutRecord
     from shared.store import Store
 
-ACTIONS = ("info", "verify", "digest", "replay", "repair", "compact", "merge", "export", "migrate", "check-place")
 MOST_WRITERS, MOST_ROUNDS = 64, 10_000
 MOST_QUARANTINED = 20
 """Quarantined rollouts that `info` lists as text; `--json` lists all."""
@@ -95,32 +96,8 @@ class CheckPlaceCommand:
     """Concurrent writers of each file."""
 
 
-def main(args: list[str]) -> int:
-    """Dispatch."""
-    match args[:1]:
-        case ["info"]:
-            return _info(parse_flags(InfoCommand, args[1:], "store info"))
-        case ["verify"]:
-            return _verify(parse_flags(VerifyCommand, args[1:], "store verify"))
-        case ["repair" | "compact" | "merge" | "export" | "migrate"]:
-            from cluster.commands import upkeep
-
-            return upkeep.main(args)
-        case ["digest"]:
-            return _digest(parse_flags(DigestCommand, args[1:], "store digest"))
-        case ["replay"]:
-            return _replay(parse_flags(ReplayCommand, args[1:], "store replay"))
-        case ["check-place"]:
-            return _check_place(parse_flags(CheckPlaceCommand, args[1:], "store check-place"))
-        case ["-h" | "--help"]:
-            print(f"usage: adaafford store {{{','.join(ACTIONS)}}} STORE; `adaafford store info --help` tells more")
-            return 0
-    given = f"'{args[0]}'" if args else "nothing"
-    raise UsageError(f"store needs one of {', '.join(ACTIONS)}; given {given}")
-
-
 def _info(command: InfoCommand) -> int:
-    from shared.store import Store, Tally, info
+    from shared.store import Store, SuccessCount, info
 
     store = Store.open(command.store)
     held = info(store)
@@ -137,7 +114,7 @@ def _info(command: InfoCommand) -> int:
         print(json.dumps(finite(described), indent=2, allow_nan=False))
         return 0
 
-    def tallies(counts: dict[str, Tally]) -> str:
+    def tallies(counts: dict[str, SuccessCount]) -> str:
         each = [f"{plain(name)} {tally.interactions} ({tally.success_rate:.1%})" for name, tally in counts.items()]
         return ", ".join(each) or "none"
 
@@ -161,14 +138,13 @@ def _info(command: InfoCommand) -> int:
 
 
 def _verify(command: VerifyCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.store import Store, verify
 
     if command.resimulate < 0 or (command.resimulate > 0) != (command.objects is not None):
         raise UsageError("--resimulate N (1 or more) needs --objects FOLDER, and the other way round")
     store = Store.open(command.store)
-    with advancing("verifying, shards") as advance:
-        problems = verify(store, advance)
+    with Progress("verifying, shards") as progress:
+        problems = verify(store, progress.show)
     said: dict[str, Any] = {"ok": not problems, "problems": [asdict(problem) for problem in problems]}
     divergence = None
     if command.objects is not None and not problems:
@@ -186,11 +162,10 @@ def _verify(command: VerifyCommand) -> int:
 
 
 def _resimulated(store: "Store", objects: Path, command: VerifyCommand) -> "Divergence":
-    from cluster.benchmarks.progress import progress
     from cluster.resimulation import resimulate
 
-    with progress("executing rows again", command.resimulate) as advance:
-        return resimulate(store, objects, command.resimulate, command.seed, advance)
+    with Progress("executing rows again", command.resimulate) as progress:
+        return resimulate(store, objects, command.resimulate, command.seed, progress.advance)
 
 
 def _as_json(divergence: "Divergence") -> dict[str, Any]:
@@ -284,3 +259,18 @@ def _check_place(command: CheckPlaceCommand) -> int:
         raise StoreError(f"{command.place}: cannot be used ({error.strerror}); name another place") from None
     print(f"{place.where}: no problems in {command.rounds} rounds of {command.writers} concurrent writers")
     return 0
+
+
+ACTIONS: dict[str, Action] = {
+    "info": (InfoCommand, _info),
+    "verify": (VerifyCommand, _verify),
+    "digest": (DigestCommand, _digest),
+    "replay": (ReplayCommand, _replay),
+    **upkeep.ACTIONS,
+    "check-place": (CheckPlaceCommand, _check_place),
+}
+
+
+def main(args: list[str]) -> int:
+    """Run one of the actions."""
+    return dispatch("store", ACTIONS, args, "STORE")

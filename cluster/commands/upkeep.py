@@ -1,15 +1,17 @@
 """`adaafford store repair|compact|merge|export|migrate`: what makes stores out of stores."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from cluster.settings import parse_flags
+from cluster.settings import Action
 from shared.errors import StoreError, UsageError
 from shared.plain import plain
+from shared.progress import Progress
 
 MOST_SHOWN = 20
 """Lines of one kind that are printed; --json has all."""
@@ -81,34 +83,19 @@ class MigrateCommand:
     """Print one JSON object instead of text."""
 
 
-def main(args: list[str]) -> int:
-    """Dispatch; `args` begin with the action.
+def _writing(execute: Callable[[Any], int]) -> Callable[[Any], int]:
+    """An action that says in one line what the disk refused; nothing is lost by that, and the same command goes on."""
 
-    Raises:
-        StoreError: the disk refuses something; nothing is lost by that, and the same command goes on.
-    """
-    try:
-        return _dispatch(args)
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        raise StoreError(
-            f"{where}cannot be written ({error.strerror or error}); check space and permissions, then repeat it"
-        ) from None
+    def run(command: Any) -> int:
+        try:
+            return execute(command)
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            raise StoreError(
+                f"{where}cannot be written ({error.strerror or error}); check space and permissions, then repeat it"
+            ) from None
 
-
-def _dispatch(args: list[str]) -> int:
-    match args[0]:
-        case "repair":
-            return _repair(parse_flags(RepairCommand, args[1:], "store repair"))
-        case "compact":
-            return _compact(parse_flags(CompactCommand, args[1:], "store compact"))
-        case "merge":
-            return _merge(parse_flags(MergeCommand, args[1:], "store merge"))
-        case "export":
-            return _export(parse_flags(ExportCommand, args[1:], "store export"))
-        case "migrate":
-            return _migrate(parse_flags(MigrateCommand, args[1:], "store migrate"))
-    raise UsageError(f"no action '{args[0]}'")
+    return run
 
 
 def _refuse_while_collecting(where: str) -> None:
@@ -131,13 +118,12 @@ def _refuse_while_collecting(where: str) -> None:
 
 
 def _repair(command: RepairCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.reproduction import reproduction
     from shared.store import repair
 
     _refuse_while_collecting(command.store)
-    with advancing("verifying, shards") as advance:
-        store, done = repair(command.store, advance)
+    with Progress("verifying, shards") as progress:
+        store, done = repair(command.store, progress.show)
     commands = [reproduction(store.where, job.shard_id, "OBJECTS") for job in done.to_collect]
     if command.json:
         jobs = [job.shard_id for job in done.to_collect]
@@ -160,13 +146,12 @@ def _repair(command: RepairCommand) -> int:
 
 
 def _compact(command: CompactCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.store import Store, compact
 
     store = Store.open(command.store)
     _refuse_while_collecting(command.store)
-    with advancing("compacting, shards") as advance:
-        done = compact(store, command.rollouts, advance)
+    with Progress("compacting, shards") as progress:
+        done = compact(store, command.rollouts, progress.show)
     if command.json:
         print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
         return 0
@@ -175,14 +160,13 @@ def _compact(command: CompactCommand) -> int:
 
 
 def _merge(command: MergeCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.store import Store, merge
 
     if not command.stores:
         raise UsageError("store merge needs one store or more, and --out")
     _refuse_while_collecting(command.out)
-    with advancing("merging, shards") as advance:
-        store, done = merge([Store.open(where) for where in command.stores], command.out, advance)
+    with Progress(f"merging into {command.out}, shards") as progress:
+        store, done = merge([Store.open(where) for where in command.stores], command.out, progress.show)
     if command.json:
         print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
         return 0
@@ -192,7 +176,6 @@ def _merge(command: MergeCommand) -> int:
 
 
 def _export(command: ExportCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from learner.data import read_object_list
     from shared.store import Store, export
     from shared.store.export import splits_by_share
@@ -202,8 +185,10 @@ def _export(command: ExportCommand) -> int:
     splits = {name: objects for name, objects in lists.items() if objects is not None}
     if splits and command.test_share:
         raise UsageError("--test-share and lists of objects exclude each other; give one")
-    with advancing("exporting, shards") as advance:
-        done = export(store, command.out, splits or splits_by_share(store, command.test_share, command.seed), advance)
+    with Progress(f"exporting into {command.out}, shards") as progress:
+        done = export(
+            store, command.out, splits or splits_by_share(store, command.test_share, command.seed), progress.show
+        )
     if command.json:
         described = {
             name: asdict(figures) | {"objects": sorted(figures.objects)} for name, figures in done.splits.items()
@@ -217,14 +202,22 @@ def _export(command: ExportCommand) -> int:
 
 
 def _migrate(command: MigrateCommand) -> int:
-    from cluster.benchmarks.progress import advancing
     from shared.store import migrate
 
-    with advancing("migrating, shards") as advance:
-        done = migrate(command.store, command.out, advance)
+    with Progress(f"migrating into {command.out}, shards") as progress:
+        done = migrate(command.store, command.out, progress.show)
     if command.json:
         print(json.dumps(asdict(done), indent=2))
         return 0
     print(f"{done.shards} shards of schema version {done.version} written anew, digest {done.digest}")
     print(f"into {command.out}; {command.store} stays as it is")
     return 0
+
+
+ACTIONS: dict[str, Action] = {
+    "repair": (RepairCommand, _writing(_repair)),
+    "compact": (CompactCommand, _writing(_compact)),
+    "merge": (MergeCommand, _writing(_merge)),
+    "export": (ExportCommand, _writing(_export)),
+    "migrate": (MigrateCommand, _writing(_migrate)),
+}

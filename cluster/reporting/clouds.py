@@ -37,7 +37,7 @@ class Arrow:
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class CloudView:
     """One cloud.
 
     Attributes:
@@ -65,7 +65,7 @@ def proposed(action: Action) -> Arrow:
     return Arrow(action, PROPOSED)
 
 
-def draw_panels(panels: Sequence[Panel], columns: int, scales: Sequence[str]) -> go.Figure:
+def draw_panels(panels: Sequence[CloudView], columns: int, scales: Sequence[str]) -> go.Figure:
     """Clouds side by side, all in the same frame and seen from where the camera of the first stood.
 
     Args:
@@ -97,7 +97,7 @@ def draw_panels(panels: Sequence[Panel], columns: int, scales: Sequence[str]) ->
     return figure
 
 
-def _traces(panel: Panel) -> list[Any]:
+def _traces(panel: CloudView) -> list[Any]:
     observation = panel.observation
     movable = np.flatnonzero(observation.movable)[:MOVABLE_POINTS]
     static = np.flatnonzero(~observation.movable)[:STATIC_POINTS]
@@ -146,7 +146,7 @@ def _arrow(arrow: Arrow) -> list[Any]:
     ]
 
 
-def _frame(panels: Sequence[Panel]) -> dict[str, Any]:
+def _frame(panels: Sequence[CloudView]) -> dict[str, Any]:
     """What all scenes have in common: the box around everything that is drawn, and the eye."""
     reach = [panel.observation.points.astype(np.float64) for panel in panels]
     for panel in panels:

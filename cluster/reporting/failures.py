@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cluster.episodes import Episode
-from cluster.reporting.clouds import Arrow, Panel, draw_panels
+from cluster.reporting.clouds import Arrow, CloudView, draw_panels
 from cluster.reporting.page import Drawing, Section, plain
 from cluster.reporting.style import FAILURE
 from cluster.reporting.words import hidden, verdict
@@ -17,7 +17,7 @@ LOOKED_AT = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class FailedExploit:
     """An exploit that failed, and how much the critic believed in it."""
 
     episode: Episode
@@ -27,7 +27,7 @@ class Failure:
 
 def failures_section(episodes: Sequence[Episode], adapter: Adapter) -> Section:
     """The failures at the greatest budget, one of each kind before any kind comes again."""
-    key, title = "failures", "Failure gallery"
+    key, title = "failures", "FailedExploit gallery"
     last = [(episode, episode.exploits[-1]) for episode in episodes if episode.exploits]
     failed = [(episode, row) for episode, row in last if not row.outcome.success]
     counted = f"{len(failed)} of the {len(last)} exploits that were looked at, at the greatest budget, failed."
@@ -45,7 +45,7 @@ def failures_section(episodes: Sequence[Episode], adapter: Adapter) -> Section:
     return Section(key, title, lead, drawings=(Drawing(figure, f"Hidden facts. {caption}.", solid=True),))
 
 
-def varied(failures: Sequence[Failure]) -> list[Failure]:
+def varied(failures: Sequence[FailedExploit]) -> list[FailedExploit]:
     """Some failures in order of belief, each kind of outcome once before any comes again."""
     turns: dict[str, int] = {}
     ranked = []
@@ -56,14 +56,14 @@ def varied(failures: Sequence[Failure]) -> list[Failure]:
     return [failure for _, failure in sorted(ranked, key=lambda pair: pair[0])][:SHOWN]
 
 
-def _believed(episode: Episode, row: InteractionRecord, adapter: Adapter) -> Failure:
+def _believed(episode: Episode, row: InteractionRecord, adapter: Adapter) -> FailedExploit:
     score = adapter.score(episode.seen_by(row), [row.action], episode.before(row))
-    return Failure(episode, row, float(score[0]))
+    return FailedExploit(episode, row, float(score[0]))
 
 
-def _panel(failure: Failure, adapter: Adapter) -> Panel:
+def _panel(failure: FailedExploit, adapter: Adapter) -> CloudView:
     episode, row = failure.episode, failure.row
     observation = episode.seen_by(row)
     title = f"{plain(episode.rollout.object.id)}: believed {100 * failure.belief:.0f}%<br>{verdict(row.outcome)}"
     values = adapter.affordance(observation, episode.before(row))
-    return Panel(title, observation, values, (Arrow(row.action, FAILURE),))
+    return CloudView(title, observation, values, (Arrow(row.action, FAILURE),))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from cluster.reporting.clouds import Panel, draw_panels, tried
+from cluster.reporting.clouds import CloudView, draw_panels, tried
 from cluster.reporting.laboratory import TRIES, Laboratory, Posterior, variations
 from cluster.reporting.page import Drawing, Section, plain, shortened
 from cluster.reporting.words import after
@@ -41,9 +41,9 @@ def hidden_facts_section(
 
 def _drawing(name: str, posteriors: Sequence[Posterior], adapter: Adapter) -> Drawing:
     first = posteriors[0].observation
-    panels = [Panel(f"{after(0)}<br>&nbsp;", first, adapter.affordance(first, []))]
+    panels = [CloudView(f"{after(0)}<br>&nbsp;", first, adapter.affordance(first, []))]
     panels += [
-        Panel(
+        CloudView(
             f"{plain(each.label)}<br>{_successes(each)}",
             each.observation,
             each.affordance,

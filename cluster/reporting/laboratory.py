@@ -20,6 +20,8 @@ from collector.partnet import read_object
 from collector.procedural.assembly import normalised
 from collector.procedural.cabinets import storage_furniture
 from collector.procedural.writing import write_object
+from collector.proposers import RepeatingProposer
+from collector.recorder import interact
 from shared import seeds
 from shared.adaptation import Adapter
 from shared.configuration import Range
@@ -28,7 +30,7 @@ from shared.geometry import camera_pose
 from shared.plan import ObjectRef, Setting
 from shared.proposers import proposer_named
 from shared.tasks import task_named
-from shared.vocabulary import Action, Direction, Float32, HiddenDynamics, Interaction, Observation
+from shared.vocabulary import Action, Direction, Float32, HiddenDynamics, Interaction, Observation, Proposer
 
 TRIES = 4
 """Actions that are tried under each value."""
@@ -91,11 +93,11 @@ class Laboratory:
             environment = self._environment(case)
             if not environment.reset(self._rng("state")) or not environment.shows_a_target():
                 continue
-            if actions:
-                history = [self._try(environment, action) for action in actions]
-            else:
-                history = self._choose(environment)
-                actions = [interaction.action for interaction in history]
+            proposer = RepeatingProposer(actions) if actions else self._proposer()
+            history = list(interact(environment, proposer, TRIES, start=environment.state()))
+            if not history:
+                continue
+            actions = actions or [interaction.action for interaction in history]
             observation = history[0].observation
             affordance = self.adapter.affordance(observation, history)
             found.append(Posterior(case.label, observation, tuple(history), affordance))
@@ -116,28 +118,8 @@ class Laboratory:
             StageClock(),
         )
 
-    def _choose(self, environment: SapienEnvironment) -> list[Interaction]:
-        proposer = proposer_named(TRIED_BY, self.adapter, self._rng("tries"), TRIES)
-        start, history = environment.state(), list[Interaction]()
-        for _ in range(TRIES):
-            environment.restore(start)
-            observation = environment.observe()
-            action = proposer.propose(observation, history)
-            if action is None:
-                break
-            history.append(Interaction(observation, action, environment.execute(action)))
-        environment.restore(start)
-        return history
-
-    def _try(self, environment: SapienEnvironment, action: Action) -> Interaction:
-        start = environment.state()
-        observation = environment.observe()
-        movable = np.flatnonzero(observation.movable)
-        nearest = movable[np.linalg.norm(observation.points[movable] - action.point, axis=1).argmin()]
-        here = replace(action, point_index=int(nearest))
-        outcome = environment.execute(here)
-        environment.restore(start)
-        return Interaction(observation, here, outcome)
+    def _proposer(self) -> Proposer:
+        return proposer_named(TRIED_BY, self.adapter, self._rng("tries"), TRIES)
 
     def _rng(self, purpose: str) -> np.random.Generator:
         """The same for every value, so that everything that is drawn is the same."""

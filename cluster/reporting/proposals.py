@@ -4,7 +4,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from cluster.episodes import Episode
-from cluster.reporting.clouds import Panel, draw_panels, proposed, tried
+from cluster.reporting.clouds import CloudView, draw_panels, proposed, tried
 from cluster.reporting.page import Drawing, Section, plain, shortened
 from cluster.reporting.words import after, hidden, verdict
 from shared.adaptation import Adapter, movable_points
@@ -40,11 +40,11 @@ def _figure(history: list[Interaction], adapter: Adapter) -> go.Figure:
         values = information(observation, before, adapter)
         title = f"AIP, {after(count)}: at most {values[observation.movable].max():.2g}"
         title += f"<br>proposes try {count + 1}" if arrows else "<br>&nbsp;"
-        above.append(Panel(title, observation, _stretched(values, observation), arrows))
+        above.append(CloudView(title, observation, _stretched(values, observation), arrows))
         shown = observations[count - 1] if count else observation
         title = f"affordance, {after(count)}<br>" + (plain(verdict(before[-1].outcome)) if before else "&nbsp;")
         arrows = (tried(before[-1]),) if before else ()
-        below.append(Panel(title, shown, adapter.affordance(shown, before), arrows, scale=1))
+        below.append(CloudView(title, shown, adapter.affordance(shown, before), arrows, scale=1))
     return draw_panels([*above, *below], len(observations), ("AIP: least to most", "AAP: affordance"))
 
 

@@ -6,62 +6,15 @@ from pathlib import Path
 
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
-from pydantic import BaseModel, ConfigDict, Field
 
-from cluster.cells import number, percent
-from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, WITHOUT_TRIES, Measure
+from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, WITHOUT_TRIES, Measure, ResultRow, ResultRows
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
 from cluster.reporting.published import published, published_figure
 from cluster.reporting.style import COLOURS, SOFT, laid_out
 from cluster.run_folder import read_json
 from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD
 from shared.configuration import parse
-
-
-class ResultRow(BaseModel):
-    """A row of results.json: a method after a budget. See `learner.evaluation.EvaluationRow`."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
-
-    method: str = Field(max_length=100)
-    budget: int
-    f_score: float | None
-    f_score_low: float | None = None
-    f_score_high: float | None = None
-    sample_success: float | None
-    sample_success_low: float | None = None
-    sample_success_high: float | None = None
-    start_success: float | None = None
-    start_success_low: float | None = None
-    start_success_high: float | None = None
-    trials: int
-    gap_closed: float | None = None
-    best_f: float | None
-    bce: float | None
-    auc: float | None
-    base_rate: float | None
-    queries: int
-    mean_tries: float | None
-
-    def value(self, measure: Measure) -> float | None:
-        """One of the measures."""
-        found: float | None = getattr(self, measure)
-        return found
-
-    def interval(self, measure: Measure) -> tuple[float, float] | None:
-        """The limits of its 95% interval; None where it has none."""
-        low, high = (getattr(self, f"{measure}_{end}") for end in ("low", "high"))
-        return None if low is None or high is None else (low, high)
-
-
-class ResultRows(BaseModel):
-    """What is read of results.json."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    task: str = Field("", max_length=100)
-    objects: int = Field(ge=0)
-    rows: tuple[ResultRow, ...]
+from shared.formatting import number, percent
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ GRID = 2.0**-14
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class MovablePart:
     """A movable part, in the object's frame, at joint position 0."""
 
     name: str
@@ -32,13 +32,13 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
-class Assembly:
+class ProceduralObject:
     """A whole object."""
 
     category: str
     body_name: str
     body: Pieces
-    parts: tuple[Part, ...]
+    parts: tuple[MovablePart, ...]
 
 
 def hinged(
@@ -49,7 +49,7 @@ def hinged(
     outward: Point,
     upper: float,
     parent: int | None = None,
-) -> Part:
+) -> MovablePart:
     """A panel that turns outward about one of its edges.
 
     Its axis runs along the outer face: a panel turned there leaves its frame and its neighbours without touching them.
@@ -61,17 +61,19 @@ def hinged(
         edge: direction from the panel's middle to the edge that it turns about.
         outward: direction in which the far edge moves first.
         upper: how far it opens, rad.
-        parent: see `Part`.
+        parent: see `MovablePart`.
     """
-    return Part(name, "revolute", pieces, corner, point(np.cross(np.negative(edge), outward)), upper, parent=parent)
+    return MovablePart(
+        name, "revolute", pieces, corner, point(np.cross(np.negative(edge), outward)), upper, parent=parent
+    )
 
 
-def sliding(name: str, pieces: Pieces, direction: Point, upper: float) -> Part:
+def sliding(name: str, pieces: Pieces, direction: Point, upper: float) -> MovablePart:
     """A part that slides along `direction`."""
-    return Part(name, "prismatic", pieces, (0.0, 0.0, 0.0), direction, upper)
+    return MovablePart(name, "prismatic", pieces, (0.0, 0.0, 0.0), direction, upper)
 
 
-def normalised(assembly: Assembly) -> Assembly:
+def normalised(assembly: ProceduralObject) -> ProceduralObject:
     """The object about the origin, its bounding box's diagonal 2, as PartNet-Mobility has it, on the grid."""
     everything = [*assembly.body, *(piece for part in assembly.parts for piece in part.pieces)]
     vertices = np.concatenate([piece.vertices for piece in everything])
@@ -85,7 +87,7 @@ def normalised(assembly: Assembly) -> Assembly:
     def place_all(pieces: Pieces) -> Pieces:
         return tuple(Mesh(place(piece.vertices), piece.faces) for piece in pieces)
 
-    def place_part(part: Part) -> Part:
+    def place_part(part: MovablePart) -> MovablePart:
         length = 1.0 if part.kind == "revolute" else scale
         return replace(
             part,

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from collector.procedural.assembly import Assembly, Part, hinged, sliding
+from collector.procedural.assembly import MovablePart, ProceduralObject, hinged, sliding
 from collector.procedural.shapes import (
     BACK,
     FRONT,
@@ -31,7 +31,7 @@ GAP = 0.006
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class FrontPanel:
     """One door or drawer of a front.
 
     Attributes:
@@ -75,17 +75,17 @@ class Carcass:
         half = self.width / 2
         return hollow_box((0.0, -half, 0.0), (self.depth, half, self.height), self.wall, (FRONT,))
 
-    def front(self, panels: Sequence[Panel]) -> tuple[Part, ...]:
+    def front(self, panels: Sequence[FrontPanel]) -> tuple[MovablePart, ...]:
         """The panels as parts."""
         return tuple(self._door(panel) if panel.kind == "door" else self._drawer(panel) for panel in panels)
 
-    def board_between(self, lower: Panel, upper: Panel) -> Pieces:
+    def board_between(self, lower: FrontPanel, upper: FrontPanel) -> Pieces:
         """A shelf where one panel ends and the next begins."""
         z = (lower.z[1] + upper.z[0]) / 2
         half = self.width / 2 - self.wall
         return (block((0.0, -half, z - self.wall / 2), (self.depth - self.wall, half, z + self.wall / 2)),)
 
-    def _plate(self, panel: Panel) -> tuple[Point, Point]:
+    def _plate(self, panel: FrontPanel) -> tuple[Point, Point]:
         """Corners of a panel's plate: over the carcass's edge where it ends there, else short of its neighbour."""
 
         def end(value: float, outline: float, sign: float) -> float:
@@ -95,7 +95,7 @@ class Carcass:
         z = end(panel.z[0], 0.0, -1), end(panel.z[1], self.height, 1)
         return (-GAP - self.thickness, y[0], z[0]), (-GAP, y[1], z[1])
 
-    def _door(self, panel: Panel) -> Part:
+    def _door(self, panel: FrontPanel) -> MovablePart:
         low, high = self._plate(panel)
         left = panel.hinge == "left"
         pieces: Pieces = (block(low, high),)
@@ -107,7 +107,7 @@ class Carcass:
         corner = (low[0], high[1] if left else low[1], (low[2] + high[2]) / 2)
         return hinged(self.door_name, pieces, corner, LEFT if left else RIGHT, FRONT, self.opens)
 
-    def _drawer(self, panel: Panel) -> Part:
+    def _drawer(self, panel: FrontPanel) -> MovablePart:
         low, high = self._plate(panel)
         pieces: Pieces = (block(low, high),)
         if panel.handle:
@@ -123,14 +123,14 @@ class Carcass:
 
 def storage_furniture(
     hinge: Literal["left", "right"], width: float = 1.0, depth: float = 0.7, height: float = 1.4, overhang: float = 0.03
-) -> Assembly:
+) -> ProceduralObject:
     """A cabinet with one closed overlay door without a handle: nothing to be seen tells the hinge's side."""
     carcass = Carcass(width, depth, height, 0.03, 0.03, overhang)
-    door = Panel("door", (-width / 2, width / 2), (0.0, height), handle=False, hinge=hinge)
-    return Assembly("StorageFurniture", "furniture_body", carcass.shell(), carcass.front([door]))
+    door = FrontPanel("door", (-width / 2, width / 2), (0.0, height), handle=False, hinge=hinge)
+    return ProceduralObject("StorageFurniture", "furniture_body", carcass.shell(), carcass.front([door]))
 
 
-def random_storage_furniture(rng: np.random.Generator) -> Assembly:
+def random_storage_furniture(rng: np.random.Generator) -> ProceduralObject:
     """A cabinet of one of five layouts; two in five hide the hinge's side of a single door."""
     layout = rng.choice(["hidden", "hidden", "doors", "drawers", "mixed"])
     carcass = _random_carcass(rng)
@@ -150,10 +150,10 @@ def random_storage_furniture(rng: np.random.Generator) -> Assembly:
         drawers = _drawers_up(carcass, split, carcass.height, int(rng.integers(1, 3)))
         panels = [*doors, *drawers]
         boards = _boards(carcass, [doors[0], *drawers])
-    return Assembly("StorageFurniture", "furniture_body", carcass.shell() + boards, carcass.front(panels))
+    return ProceduralObject("StorageFurniture", "furniture_body", carcass.shell() + boards, carcass.front(panels))
 
 
-def random_refrigerator(rng: np.random.Generator) -> Assembly:
+def random_refrigerator(rng: np.random.Generator) -> ProceduralObject:
     """One door, a freezer above, or two doors side by side."""
     carcass = Carcass(
         width=float(rng.uniform(0.65, 0.85)),
@@ -167,7 +167,7 @@ def random_refrigerator(rng: np.random.Generator) -> Assembly:
     )
     handle, side = bool(carcass.overhang == 0.0 or rng.random() < 0.5), _side(rng)
     across, up = (-carcass.width / 2, carcass.width / 2), (0.0, carcass.height)
-    whole = Panel("door", across, up, handle, side)
+    whole = FrontPanel("door", across, up, handle, side)
     boards: Pieces = ()
     match rng.choice(["one", "freezer", "beside"]):
         case "one":
@@ -178,17 +178,19 @@ def random_refrigerator(rng: np.random.Generator) -> Assembly:
             boards = carcass.board_between(*panels)
         case _:
             panels = _pair(whole)
-    return Assembly("Refrigerator", "refrigerator_body", carcass.shell() + boards, carcass.front(panels))
+    return ProceduralObject("Refrigerator", "refrigerator_body", carcass.shell() + boards, carcass.front(panels))
 
 
-def random_table(rng: np.random.Generator) -> Assembly:
+def random_table(rng: np.random.Generator) -> ProceduralObject:
     """A top on four legs, with drawers below it."""
     width, depth, height = float(rng.uniform(1.2, 1.5)), float(rng.uniform(0.6, 0.8)), float(rng.uniform(0.7, 0.9))
     box_height, leg = float(rng.uniform(0.2, 0.3)), 0.05
     carcass = Carcass(width - 0.1, depth - 0.1, box_height, 0.025, 0.025, 0.0)
     columns = np.linspace(-carcass.width / 2, carcass.width / 2, int(rng.integers(1, 4)) + 1)
     handle = bool(rng.random() < 0.8)
-    drawers = [Panel("drawer", (float(low), float(high)), (0.0, box_height), handle) for low, high in pairwise(columns)]
+    drawers = [
+        FrontPanel("drawer", (float(low), float(high)), (0.0, box_height), handle) for low, high in pairwise(columns)
+    ]
     back = carcass.depth
     dividers = tuple(block((0.0, y - 0.01, 0.025), (back, y + 0.01, box_height - 0.025)) for y in columns[1:-1])
     # The top reaches further forward than the drawers' fronts, or as far: both occur.
@@ -199,10 +201,12 @@ def random_table(rng: np.random.Generator) -> Assembly:
         for x in (0.0, back - leg)
         for y in (-(carcass.width - leg) / 2, (carcass.width - leg) / 2)
     )
-    return Assembly("Table", "furniture_body", (*carcass.shell(), *dividers, top, *legs), carcass.front(drawers))
+    return ProceduralObject(
+        "Table", "furniture_body", (*carcass.shell(), *dividers, top, *legs), carcass.front(drawers)
+    )
 
 
-def random_safe(rng: np.random.Generator) -> Assembly:
+def random_safe(rng: np.random.Generator) -> ProceduralObject:
     """A thick box whose door carries a dial that turns by itself."""
     carcass = Carcass(
         width=float(rng.uniform(0.9, 1.2)),
@@ -215,23 +219,23 @@ def random_safe(rng: np.random.Generator) -> Assembly:
         door_name="door",
     )
     side = _side(rng)
-    panel = Panel(
+    panel = FrontPanel(
         "door", (-carcass.width / 2, carcass.width / 2), (0.0, carcass.height), bool(rng.random() < 0.7), side
     )
     (door,) = carcass.front([panel])
     face, y = -GAP - carcass.thickness, 0.1 * carcass.width * (1 if side == "left" else -1)
     dial = knob("knob", (face, y, 0.65 * carcass.height), 0.09, parent=0)
-    return Assembly("Safe", "safe_body", carcass.shell(), (door, dial))
+    return ProceduralObject("Safe", "safe_body", carcass.shell(), (door, dial))
 
 
-def knob(name: str, centre: Point, radius: float, parent: int | None = None) -> Part:
+def knob(name: str, centre: Point, radius: float, parent: int | None = None) -> MovablePart:
     """A dial with a ridge across it, which turns about the x axis, on a front whose surface is at `centre`."""
     x, y, z = centre
     pieces = (
         rod((x - 0.002, y, z), (x - 0.04, y, z), radius, 0.85 * radius, sides=20),
         block((x - 0.08, y - 0.15 * radius, z - 0.8 * radius), (x - 0.04, y + 0.15 * radius, z + 0.8 * radius)),
     )
-    return Part(name, "revolute", pieces, centre, BACK, np.pi, parent=parent)
+    return MovablePart(name, "revolute", pieces, centre, BACK, np.pi, parent=parent)
 
 
 def _random_carcass(rng: np.random.Generator) -> Carcass:
@@ -247,7 +251,7 @@ def _side(rng: np.random.Generator) -> Literal["left", "right"]:
     return "left" if rng.random() < 0.5 else "right"
 
 
-def _pair(whole: Panel) -> list[Panel]:
+def _pair(whole: FrontPanel) -> list[FrontPanel]:
     """Two doors in place of one, hinged at the outer sides."""
     middle = (whole.y[0] + whole.y[1]) / 2
     return [
@@ -256,16 +260,16 @@ def _pair(whole: Panel) -> list[Panel]:
     ]
 
 
-def _doors_across(carcass: Carcass, z: tuple[float, float], rng: np.random.Generator) -> list[Panel]:
-    whole = Panel("door", (-carcass.width / 2, carcass.width / 2), z, bool(rng.random() < 0.7), _side(rng))
+def _doors_across(carcass: Carcass, z: tuple[float, float], rng: np.random.Generator) -> list[FrontPanel]:
+    whole = FrontPanel("door", (-carcass.width / 2, carcass.width / 2), z, bool(rng.random() < 0.7), _side(rng))
     return _pair(whole) if rng.random() < 0.6 else [whole]
 
 
-def _drawers_up(carcass: Carcass, low: float, high: float, count: int) -> list[Panel]:
+def _drawers_up(carcass: Carcass, low: float, high: float, count: int) -> list[FrontPanel]:
     heights = np.linspace(low, high, count + 1)
     across = (-carcass.width / 2, carcass.width / 2)
-    return [Panel("drawer", across, (float(bottom), float(top))) for bottom, top in pairwise(heights)]
+    return [FrontPanel("drawer", across, (float(bottom), float(top))) for bottom, top in pairwise(heights)]
 
 
-def _boards(carcass: Carcass, stacked: Sequence[Panel]) -> Pieces:
+def _boards(carcass: Carcass, stacked: Sequence[FrontPanel]) -> Pieces:
     return tuple(board for low, high in pairwise(stacked) for board in carcass.board_between(low, high))

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from collector.procedural.appliances import random_microwave, random_washing_machine
-from collector.procedural.assembly import Assembly, normalised
+from collector.procedural.assembly import ProceduralObject, normalised
 from collector.procedural.cabinets import (
     random_refrigerator,
     random_safe,
@@ -23,7 +23,7 @@ from collector.procedural.faucets import random_faucet
 from collector.procedural.openings import random_door, random_switch, random_window
 from shared.seeds import generator
 
-CATEGORIES: Mapping[str, Callable[[np.random.Generator], Assembly]] = {
+CATEGORIES: Mapping[str, Callable[[np.random.Generator], ProceduralObject]] = {
     "StorageFurniture": random_storage_furniture,
     "Faucet": random_faucet,
     "Box": random_box,
@@ -43,6 +43,6 @@ CATEGORIES: Mapping[str, Callable[[np.random.Generator], Assembly]] = {
 """The paper's fifteen, called as PartNet-Mobility calls them."""
 
 
-def build(category: str, seed: int, index: int) -> Assembly:
+def build(category: str, seed: int, index: int) -> ProceduralObject:
     """Object number `index` of a category: a pure function of its arguments, whatever else is made."""
     return normalised(CATEGORIES[category](generator(seed, f"procedural {category}", index)))

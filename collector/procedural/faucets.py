@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from collector.procedural.assembly import Assembly, Part
+from collector.procedural.assembly import MovablePart, ProceduralObject
 from collector.procedural.shapes import BOTTOM, TOP, Pieces, Point, block, moved, rod
 
 
-def random_faucet(rng: np.random.Generator) -> Assembly:
+def random_faucet(rng: np.random.Generator) -> ProceduralObject:
     """One switch on top of the column, or two on pedestals beside it; the sense of each axis is drawn."""
     height, radius = float(rng.uniform(0.7, 1.1)), float(rng.uniform(0.08, 0.13))
     reach = float(rng.uniform(0.7, 1.0))
@@ -29,9 +29,9 @@ def random_faucet(rng: np.random.Generator) -> Assembly:
     heading = 0.0 if twin or rng.random() < 0.5 else np.pi
     switches = [_switch(str(style), stand, size, heading, upper, rng) for stand in stands]
     if twin and rng.random() < 0.4:
-        turning = Part("spout", "revolute", spout, (0.0, 0.0, height), TOP, np.pi / 2)
-        return Assembly("Faucet", "faucet_base", body, (*switches, turning))
-    return Assembly("Faucet", "faucet_base", body + spout, tuple(switches))
+        turning = MovablePart("spout", "revolute", spout, (0.0, 0.0, height), TOP, np.pi / 2)
+        return ProceduralObject("Faucet", "faucet_base", body, (*switches, turning))
+    return ProceduralObject("Faucet", "faucet_base", body + spout, tuple(switches))
 
 
 def _spout(reach: float, height: float, radius: float) -> Pieces:
@@ -43,7 +43,9 @@ def _spout(reach: float, height: float, radius: float) -> Pieces:
     )
 
 
-def _switch(style: str, stand: Point, size: float, heading: float, upper: float, rng: np.random.Generator) -> Part:
+def _switch(
+    style: str, stand: Point, size: float, heading: float, upper: float, rng: np.random.Generator
+) -> MovablePart:
     """A switch that turns about the vertical through `stand`.
 
     Args:
@@ -63,7 +65,7 @@ def _switch(style: str, stand: Point, size: float, heading: float, upper: float,
         grips = _arms(0.45 * size, heading + np.pi / 5, 5)
         arms = (rod((0.0, 0.0, 0.1), (0.0, 0.0, 0.2), 0.35 * size, sides=20), *moved(grips, (0.0, 0.0, 0.02)))
     axis = TOP if rng.random() < 0.5 else BOTTOM
-    return Part("switch", "revolute", moved((hub, *arms), stand), stand, axis, upper)
+    return MovablePart("switch", "revolute", moved((hub, *arms), stand), stand, axis, upper)
 
 
 def _arms(length: float, heading: float, count: int) -> Pieces:

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from collector.procedural.assembly import Assembly, Part, hinged, sliding
+from collector.procedural.assembly import MovablePart, ProceduralObject, hinged, sliding
 from collector.procedural.cabinets import GAP
 from collector.procedural.shapes import (
     BACK,
@@ -22,7 +22,7 @@ from collector.procedural.shapes import (
 )
 
 
-def random_door(rng: np.random.Generator) -> Assembly:
+def random_door(rng: np.random.Generator) -> ProceduralObject:
     """A frame and one door, or two."""
     width, height = float(rng.uniform(0.8, 1.2)), float(rng.uniform(1.4, 1.7))
     depth, post = float(rng.uniform(0.08, 0.12)), 0.08
@@ -35,10 +35,10 @@ def random_door(rng: np.random.Generator) -> Assembly:
     else:
         leaves = [((-half, 0.0), False), ((0.0, half), True)]
     doors = tuple(_leaf(y, height, 0.6 * depth, left, opens) for y, left in leaves)
-    return Assembly("Door", "door_frame", frame, doors)
+    return ProceduralObject("Door", "door_frame", frame, doors)
 
 
-def random_window(rng: np.random.Generator) -> Assembly:
+def random_window(rng: np.random.Generator) -> ProceduralObject:
     """A frame with two sashes: casements that turn outward, or one that slides behind the other's plane."""
     width, height, bar = float(rng.uniform(1.0, 1.4)), float(rng.uniform(1.0, 1.4)), 0.06
     half = width / 2
@@ -46,18 +46,18 @@ def random_window(rng: np.random.Generator) -> Assembly:
     if rng.random() < 0.5:
         low, high = (0.0, -half + GAP, GAP), (0.06, -GAP / 2, height - GAP)
         opens = float(rng.uniform(1.0, 1.6))
-        sashes: tuple[Part, ...] = tuple(
+        sashes: tuple[MovablePart, ...] = tuple(
             _casement(low_y, high_y, height, edge, opens)
             for low_y, high_y, edge in ((low[1], high[1], RIGHT), (-high[1], -low[1], LEFT))
         )
-        return Assembly("Window", "window_frame", frame, sashes)
+        return ProceduralObject("Window", "window_frame", frame, sashes)
     fixed = _sash((0.09, 0.0, 0.0), (0.14, half, height), bar)
     slider = _sash((0.02, -half + GAP, GAP), (0.07, bar, height - GAP), bar)
     slider += grip((0.02, -half + bar, height / 2), TOP, FRONT, 0.25, 0.05, 0.012)
-    return Assembly("Window", "window_frame", frame + fixed, (sliding("window", slider, LEFT, 0.85 * half),))
+    return ProceduralObject("Window", "window_frame", frame + fixed, (sliding("window", slider, LEFT, 0.85 * half),))
 
 
-def random_switch(rng: np.random.Generator) -> Assembly:
+def random_switch(rng: np.random.Generator) -> ProceduralObject:
     """A plate on a wall with one to three levers, each flipped up or down."""
     count = int(rng.integers(1, 4))
     pitch, height, reach = 0.45, float(rng.uniform(0.9, 1.3)), float(rng.uniform(0.2, 0.35))
@@ -65,10 +65,10 @@ def random_switch(rng: np.random.Generator) -> Assembly:
     style: Literal["lever", "rocker"] = "lever" if rng.random() < 0.6 else "rocker"
     middles = (np.arange(count) - (count - 1) / 2) * pitch
     levers = tuple(_lever(float(y), reach, style) for y in middles)
-    return Assembly("Switch", "switch_frame", (plate,), levers)
+    return ProceduralObject("Switch", "switch_frame", (plate,), levers)
 
 
-def _leaf(y: tuple[float, float], height: float, thickness: float, left: bool, opens: float) -> Part:
+def _leaf(y: tuple[float, float], height: float, thickness: float, left: bool, opens: float) -> MovablePart:
     """A door leaf between two sides of its opening, flush with the frame's front, with grips on both faces."""
     low, high = (0.0, y[0] + GAP, GAP), (thickness, y[1] - GAP, height - GAP)
     free = low[1] + 0.1 if left else high[1] - 0.1
@@ -79,7 +79,7 @@ def _leaf(y: tuple[float, float], height: float, thickness: float, left: bool, o
     return hinged("rotation_door", pieces, corner, LEFT if left else RIGHT, FRONT, opens)
 
 
-def _casement(low_y: float, high_y: float, height: float, edge: Point, opens: float) -> Part:
+def _casement(low_y: float, high_y: float, height: float, edge: Point, opens: float) -> MovablePart:
     """A sash flush with the frame's front, with a grip at its free side."""
     pieces = _sash((0.0, low_y, GAP), (0.06, high_y, height - GAP), 0.06)
     hinge, free = (high_y, low_y) if edge == LEFT else (low_y, high_y)
@@ -95,7 +95,7 @@ def _sash(low: Point, high: Point, bar: float) -> Pieces:
     return (*ring(low, high, bar), pane)
 
 
-def _lever(y: float, reach: float, style: Literal["lever", "rocker"]) -> Part:
+def _lever(y: float, reach: float, style: Literal["lever", "rocker"]) -> MovablePart:
     """A lever that starts tilted down and is flipped up, about a horizontal axis in the plate's face."""
     tilt, half = 0.4, 0.05 if style == "lever" else 0.14
     stub = block((-reach, -half, -0.05), (-0.002, half, 0.05))
@@ -104,4 +104,4 @@ def _lever(y: float, reach: float, style: Literal["lever", "rocker"]) -> Part:
     cos, sin = np.cos(tilt), np.sin(tilt)
     tilted = np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]])
     piece = type(stub)(stub.vertices @ tilted.T + [0.0, y, 0.0], stub.faces)
-    return Part("switch", "revolute", (piece,), (0.0, y, 0.0), LEFT, 2 * tilt)
+    return MovablePart("switch", "revolute", (piece,), (0.0, y, 0.0), LEFT, 2 * tilt)

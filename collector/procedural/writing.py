@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 from collector.articulation import Mesh
 from collector.files import short
 from collector.partnet import META_FILE, SEMANTICS_FILE, URDF_FILE
-from collector.procedural.assembly import Assembly, Part
+from collector.procedural.assembly import MovablePart, ProceduralObject
 from collector.procedural.catalogue import CATEGORIES, build
 from collector.procedural.shapes import Pieces, Point
 from shared.errors import UsageError
@@ -53,7 +53,7 @@ def generate(out: Path, counts: Mapping[str, int], seed: int) -> list[Path]:
         raise UsageError(f"{out}: cannot be written ({error.strerror}); name a folder that can") from None
 
 
-def write_object(folder: Path, assembly: Assembly) -> Path:
+def write_object(folder: Path, assembly: ProceduralObject) -> Path:
     """Write one object as `folder`, whose name becomes its id.
 
     Raises:
@@ -62,7 +62,7 @@ def write_object(folder: Path, assembly: Assembly) -> Path:
     return _write_folder(folder, object_files(assembly))
 
 
-def object_files(assembly: Assembly) -> dict[str, str]:
+def object_files(assembly: ProceduralObject) -> dict[str, str]:
     """The files of an object, by relative path."""
     bodies = [(assembly.body_name, assembly.body), *((part.name, part.pieces) for part in assembly.parts)]
     # As in PartNet-Mobility, movable links come first and the body last.
@@ -81,7 +81,7 @@ def object_files(assembly: Assembly) -> dict[str, str]:
     return files
 
 
-def _urdf(assembly: Assembly, links: list[str]) -> str:
+def _urdf(assembly: ProceduralObject, links: list[str]) -> str:
     lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr(assembly.category)}>", '\t<link name="base"/>']
     lines += _link_lines(links[0], assembly.body_name, assembly.body, (0.0, 0.0, 0.0))
     lines += _joint_lines("joint_body", "fixed", "base", links[0], (0.0, 0.0, 0.0))
@@ -98,7 +98,7 @@ def _urdf(assembly: Assembly, links: list[str]) -> str:
     return "\n".join([*lines, "</robot>", ""])
 
 
-def _parent(assembly: Assembly, part: Part) -> tuple[int, Point]:
+def _parent(assembly: ProceduralObject, part: MovablePart) -> tuple[int, Point]:
     """Index among links, and frame origin, of what the part hangs on."""
     if part.parent is None:
         return 0, (0.0, 0.0, 0.0)
@@ -119,7 +119,9 @@ def _link_lines(link: str, name: str, pieces: Pieces, origin: Point) -> list[str
     return [*lines, "\t</link>"]
 
 
-def _joint_lines(name: str, kind: str, parent: str, child: str, xyz: Point, part: Part | None = None) -> list[str]:
+def _joint_lines(
+    name: str, kind: str, parent: str, child: str, xyz: Point, part: MovablePart | None = None
+) -> list[str]:
     lines = [
         f'\t<joint name="{name}" type="{kind}">',
         f'\t\t<origin xyz="{_numbers(xyz)}"/>',

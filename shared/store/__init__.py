@@ -3,7 +3,7 @@
 from shared.store.compaction import Compaction, compact
 from shared.store.conformance import check_place
 from shared.store.export import Export, export
-from shared.store.info import StoreInfo, Tally, info
+from shared.store.info import StoreInfo, SuccessCount, info
 from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
 from shared.store.merging import Merged, merge
 from shared.store.migration import Migrated, migrate
@@ -27,7 +27,7 @@ __all__ = [
     "ShardManifest",
     "Store",
     "StoreInfo",
-    "Tally",
+    "SuccessCount",
     "check_place",
     "compact",
     "export",

@@ -1,13 +1,17 @@
 """The card of exported data: what it is, how much, how often things succeed, where it comes from, who may use it."""
 
+import itertools
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from shared.formatting import markdown_table
 from shared.plain import markdown
 from shared.store.store import Store
 from shared.vocabulary import OutcomeKind
+
+SPLIT_COLUMNS = ("split", "objects", "rollouts", "clouds", "interactions", "success rate")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,24 +55,19 @@ class SplitFigures:
 def data_card(store: Store, splits: dict[str, SplitFigures]) -> str:
     """The card, as Markdown."""
     setting, software = store.setting, store.document.software
+    categories = sorted({category for figures in splits.values() for category in figures.labels})
+    by_category = ["category", *(f"{name}: {what}" for name in splits for what in ("labels", "success rate"))]
     lines = [
         f"# Interactions with articulated objects: {setting.task}",
         "",
         "Trials of a flying gripper on articulated objects in simulation (SAPIEN), after AdaAfford (ECCV 2022): where",
         "and how it touched, the hidden dynamics, and what came of it, failures included.",
         "",
-        "| split | objects | rollouts | clouds | interactions | success rate |",
-        "| --- | --- | --- | --- | --- | --- |",
-        *(
-            f"| {name} | {len(f.objects)} | {f.rollouts} | {f.observations} | {f.interactions} | {_rate(f, None)} |"
-            for name, f in splits.items()
-        ),
+        *markdown_table(SPLIT_COLUMNS, itertools.starmap(_split_cells, splits.items()), left=len(SPLIT_COLUMNS)),
         "",
         "## Base rates by category",
         "",
-        f"| category | {' | '.join(f'{name}: labels | {name}: success rate' for name in splits)} |",
-        f"| --- |{' --- | --- |' * len(splits)}",
-        *(_category_line(category, splits) for category in sorted({c for f in splits.values() for c in f.labels})),
+        *markdown_table(by_category, (_category_cells(name, splits) for name in categories), left=len(by_category)),
         "",
         "## How trials ended",
         "",
@@ -102,9 +101,14 @@ def _listed(values: Mapping[str, object]) -> str:
     return ", ".join(f"{markdown(name)} {markdown(value)}" for name, value in sorted(values.items()))
 
 
-def _category_line(category: str, splits: dict[str, SplitFigures]) -> str:
-    cells = (f"{f.labels.get(category, 0)} | {_rate(f, category)}" for f in splits.values())
-    return f"| {markdown(category)} | {' | '.join(cells)} |"
+def _split_cells(name: str, figures: SplitFigures) -> list[str]:
+    counts = (len(figures.objects), figures.rollouts, figures.observations, figures.interactions)
+    return [name, *map(str, counts), _rate(figures, None)]
+
+
+def _category_cells(category: str, splits: dict[str, SplitFigures]) -> list[str]:
+    counted = ((str(f.labels.get(category, 0)), _rate(f, category)) for f in splits.values())
+    return [markdown(category), *itertools.chain.from_iterable(counted)]
 
 
 def _rate(figures: SplitFigures, category: str | None) -> str:

@@ -8,22 +8,23 @@ _MAX_VALUE = 60
 
 def difference_of(stored: dict[str, Any], given: dict[str, Any]) -> str:
     """The first setting that differs, with both values, and how many more do."""
-    differences = list(_walk(stored, given, ""))
-    more = f" (and {len(differences) - 1} more)" if len(differences) > 1 else ""
-    return (differences[0] if differences else "they are equal") + more
+    found = [f"{name}: the store has {ours}, given {theirs}" for name, ours, theirs in differences(stored, given)]
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    return (found[0] if found else "they are equal") + more
 
 
-def _walk(stored: Any, given: Any, name: str) -> Iterator[str]:
-    if isinstance(stored, dict) and isinstance(given, dict):
-        for key in dict.fromkeys([*stored, *given]):
-            yield from _walk(stored.get(key), given.get(key), f"{name}.{key}" if name else key)
-    elif isinstance(stored, list) and isinstance(given, list) and len(stored) != len(given):
-        yield f"{name}: the store has {len(stored)} entries, given {len(given)}"
-    elif isinstance(stored, list) and isinstance(given, list):
-        for k, (ours, theirs) in enumerate(zip(stored, given, strict=True)):
-            yield from _walk(ours, theirs, f"{name}[{k}]")
-    elif stored != given:
-        yield f"{name}: the store has {_brief(stored)}, given {_brief(given)}"
+def differences(before: Any, after: Any, name: str = "") -> Iterator[tuple[str, str, str]]:
+    """Every setting that differs between two documents of `name`: its name, and both values, shortened."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in dict.fromkeys([*before, *after]):
+            yield from differences(before.get(key), after.get(key), f"{name}.{key}" if name else key)
+    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        for k, (old, new) in enumerate(zip(before, after, strict=True)):
+            yield from differences(old, new, f"{name}[{k}]")
+    elif isinstance(before, list) and isinstance(after, list):
+        yield name, f"{len(before)} entries", str(len(after))
+    elif before != after:
+        yield name, _brief(before), _brief(after)
 
 
 def _brief(value: Any) -> str:

@@ -13,13 +13,18 @@ import numpy as np
 
 from shared.records import RolloutRecord, RolloutStatus
 from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, Column, InteractionRow, RolloutRow
-from shared.store.observations import ARRAYS
+from shared.store.observations import Packed, pack
 
 Row = TypeVar("Row")
 
 
-def rollout_digest(rollout: RolloutRecord) -> str:
-    """SHA-256 of one rollout, over the canonical little-endian bytes of its columns and clouds."""
+def rollout_digest(rollout: RolloutRecord, clouds: Sequence[Packed] | None = None) -> str:
+    """SHA-256 of one rollout, over the canonical little-endian bytes of its columns and clouds.
+
+    Args:
+        rollout: the rollout.
+        clouds: its observations as `observations.pack` makes them, where somebody has them.
+    """
     digest = hashlib.sha256()
     if rollout.status is RolloutStatus.NEVER_AT_REST:
         # Earlier software did not tell the two apart; the same plan shall have the digest that it had.
@@ -27,10 +32,9 @@ def rollout_digest(rollout: RolloutRecord) -> str:
     _add_columns(digest, ROLLOUT_COLUMNS, [RolloutRow(rollout, 0)])
     rows = [InteractionRow(rollout, interaction, 0) for interaction in rollout.interactions]
     _add_columns(digest, INTERACTION_COLUMNS, rows)
-    for observation in rollout.observations:
-        for array in ARRAYS:
-            packed = array.pack(getattr(observation, array.name))
-            _add(digest, array.name, packed.shape, packed.tobytes())
+    for cloud in map(pack, rollout.observations) if clouds is None else clouds:
+        for name, packed in cloud.items():
+            _add(digest, name, packed.shape, packed.tobytes())
     return digest.hexdigest()
 
 

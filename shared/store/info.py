@@ -13,7 +13,7 @@ from shared.vocabulary import OutcomeKind
 
 
 @dataclass(frozen=True, slots=True)
-class Tally:
+class SuccessCount:
     """How many interactions, and how many of them succeeded; infrastructure failures are in neither."""
 
     interactions: int
@@ -34,10 +34,10 @@ class StoreInfo:
     interactions: int
     observations: int
     bytes: int
-    by_category: dict[str, Tally]
-    by_proposer: dict[str, Tally]
+    by_category: dict[str, SuccessCount]
+    by_proposer: dict[str, SuccessCount]
     """By proposer and policy version, such as "aip v1"."""
-    by_role: dict[str, Tally]
+    by_role: dict[str, SuccessCount]
     by_outcome: dict[str, int]
     by_status: dict[str, int]
     """Rollouts by status."""
@@ -113,6 +113,6 @@ class _Tallies:
         self._succeeded[name] += success
 
     @property
-    def found(self) -> dict[str, Tally]:
+    def found(self) -> dict[str, SuccessCount]:
         """In order of name."""
-        return {name: Tally(count, self._succeeded[name]) for name, count in sorted(self._tried.items())}
+        return {name: SuccessCount(count, self._succeeded[name]) for name, count in sorted(self._tried.items())}

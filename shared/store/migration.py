@@ -39,7 +39,7 @@ _NOTE = f"{STATUS_FOLDER}/migration.json"
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class MigrationStep:
     """What leads from one schema version to the next.
 
     Attributes:
@@ -51,7 +51,7 @@ class Step:
     shard: Callable[[dict[str, bytes], Content], tuple[dict[str, bytes], Content]]
 
 
-STEPS: dict[int, Step] = {}
+STEPS: dict[int, MigrationStep] = {}
 """By the version that a step begins with; version 1 is the first that was ever published."""
 
 
@@ -108,7 +108,7 @@ def migrate(where: str | Path, out: str | Path, progress: Callable[[int, int], N
     return Migrated(SCHEMA_VERSION - len(steps), len(jobs), Store.open(out).digest())
 
 
-def _steps(version: Any, where: str) -> list[Step]:
+def _steps(version: Any, where: str) -> list[MigrationStep]:
     """What leads from a version to the current one."""
     if version == SCHEMA_VERSION:
         raise UsageError(f"{where}: is of schema version {version}, which this software reads; nothing to migrate")
@@ -123,13 +123,13 @@ def _document(place: Place, key: str) -> Content:
     return unseal(place.read(key, MAX_DOCUMENT_BYTES), f"{place.where}/{key}")
 
 
-def _applied(steps: list[Step], what: str, content: Content) -> Content:
+def _applied(steps: list[MigrationStep], what: str, content: Content) -> Content:
     for step in steps:
         content = step.document(what, content)
     return content
 
 
-def _migrate_shard(steps: list[Step], old: Folder, target: Place) -> None:
+def _migrate_shard(steps: list[MigrationStep], old: Folder, target: Place) -> None:
     described = _document(old.place, f"{old.key}/{MANIFEST_FILE}")
     files = _checked_files(old, described.get("files"))
     for step in steps:

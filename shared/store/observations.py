@@ -139,14 +139,23 @@ def check_observation(observation: Observation, points: int) -> None:
         raise ValueError("observation's normals are not rounded (see shared.observation)")
 
 
-def encode(observations: Sequence[Observation], points: int) -> dict[str, bytes]:
+Packed = Mapping[str, NDArray[Any]]
+"""One observation as it is stored, by the name of the array."""
+
+
+def pack(observation: Observation) -> Packed:
+    """An observation as it is stored: for the arrays of the group, and for the content digest."""
+    return {kind.name: kind.pack(getattr(observation, kind.name)) for kind in ARRAYS}
+
+
+def encode(observations: Sequence[Packed], points: int) -> dict[str, bytes]:
     """The files of the group, by path within it."""
     memory: dict[str, Buffer] = {}
     group = zarr.create_group(MemoryStore(memory), zarr_format=3)
     for kind in ARRAYS:
         data = np.empty((len(observations), *kind.shape(points)), kind.kept)
         for k, observation in enumerate(observations):
-            data[k] = kind.pack(getattr(observation, kind.name))
+            data[k] = observation[kind.name]
         array = group.create_array(
             kind.name,
             shape=data.shape,

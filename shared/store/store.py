@@ -378,11 +378,6 @@ class Store:
         return self.path / SHARDS_FOLDER
 
     @property
-    def policies_folder(self) -> Path:
-        """Where policies lie; raises as `path` does."""
-        return self.path / POLICIES_FOLDER
-
-    @property
     def underway(self) -> Underway:
         """Where workers leave their breadcrumbs."""
         return Underway(None, self.where) if is_url(self.where) else Underway(self.path / UNDERWAY_FOLDER)

@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shared.documents import printable
 from shared.errors import StoreError
+from shared.plain import MAX_WORD, plain
 from shared.store.columns import INTERACTION_COLUMNS, LIST, ROLLOUT_COLUMNS, Column
 from shared.store.pages import unpacked_size
 
@@ -85,7 +85,7 @@ def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Seq
     except (pa.ArrowException, OSError, ValueError, LookupError, OverflowError) as error:
         if isinstance(error, StoreError):
             raise
-        line = printable(" ".join(str(error).split()), 100)
+        line = plain(" ".join(str(error).split()), 100)
         raise StoreError(f"{source}: cannot be decoded ({line}); the file is damaged or foreign") from None
     left = size_limit(rows)
     fields, arrays = [], []
@@ -111,7 +111,9 @@ def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Seq
             if pa.types.is_dictionary(field.type):
                 left -= _size_of_texts(cells)
                 if left < 0:
-                    raise StoreError(f"{source}: column {printable(field.name)} is too large; the file is foreign")
+                    raise StoreError(
+                        f"{source}: column {plain(field.name, MAX_WORD)} is too large; the file is foreign"
+                    )
                 cells = cells.cast(field.type.value_type)
             fields.append(pa.field(field.name, cells.type, field.nullable))
             arrays.append(cells)
@@ -207,9 +209,11 @@ def _check_cells(cells: Any, column: Column[Any], most: int, source: str) -> int
             continue
         for word in chunk.dictionary.to_pylist():
             if column.allowed is not None and word not in list(column.allowed):
-                raise StoreError(f"{source}: column {column.name} holds '{printable(word)}'; it is damaged or foreign")
+                raise StoreError(
+                    f"{source}: column {column.name} holds '{plain(word, MAX_WORD)}'; it is damaged or foreign"
+                )
             if len(word) > column.longest or not word.isprintable():
-                what = f"a text of {len(word)} characters, '{printable(word, 40)}'"
+                what = f"a text of {len(word)} characters, '{plain(word, 40)}'"
                 raise StoreError(f"{source}: column {column.name} holds {what}; it is damaged or foreign")
     if not column.dtype:
         size = _size_of_texts(cells)

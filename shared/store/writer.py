@@ -78,7 +78,8 @@ def commit_shard(
     check_rollouts(rollouts, job, points, job.shard_id)
     check_quarantined(rollouts, quarantined, job.shard_id)
     unknown = unknown or Unknown({}, {})
-    files = _encode(rollouts, points, unknown.tables)
+    clouds = [[observations.pack(observation) for observation in rollout.observations] for rollout in rollouts]
+    files = _encode(rollouts, clouds, points, unknown.tables)
     manifest = ShardManifest(
         plan_key=job.plan_key,
         start=job.start,
@@ -87,7 +88,7 @@ def commit_shard(
         observations=sum(len(rollout.observations) for rollout in rollouts),
         points=points,
         files=_entries(files),
-        digests=tuple(rollout_digest(rollout) for rollout in rollouts),
+        digests=tuple(map(rollout_digest, rollouts, clouds)),
         software=store_software(),
         # No host's name and no path goes into a manifest, also where older software wrote what is written again.
         provenance=process_provenance() | {n: str(value) for n, value in provenance.items() if n != "host"},
@@ -151,18 +152,23 @@ def _publish(place: Place, manifest: ShardManifest, files: Mapping[str, bytes], 
     place.publish(Publication(shard.key, files, MANIFEST_FILE, describe, admit, lock=manifest.plan_key))
 
 
-def _encode(rollouts: Sequence[RolloutRecord], points: int, unknown: Mapping[str, Any]) -> dict[str, bytes]:
-    """All files of a shard but its manifest, by path within it."""
+def _encode(
+    rollouts: Sequence[RolloutRecord],
+    clouds: Sequence[Sequence[observations.Packed]],
+    points: int,
+    unknown: Mapping[str, Any],
+) -> dict[str, bytes]:
+    """All files of a shard but its manifest, by path within it; `clouds` are the observations of each rollout."""
     rollout_rows, interaction_rows, first = [], [], 0
     for rollout in rollouts:
         rollout_rows.append(RolloutRow(rollout, first))
         interaction_rows += [InteractionRow(rollout, interaction, first) for interaction in rollout.interactions]
         first += len(rollout.observations)
-    clouds = observations.encode([o for rollout in rollouts for o in rollout.observations], points)
+    group = observations.encode([cloud for of_rollout in clouds for cloud in of_rollout], points)
     return {
         ROLLOUTS_FILE: table_bytes(ROLLOUT_COLUMNS, rollout_rows, unknown.get(ROLLOUTS_FILE)),
         INTERACTIONS_FILE: table_bytes(INTERACTION_COLUMNS, interaction_rows, unknown.get(INTERACTIONS_FILE)),
-        **{f"{OBSERVATIONS_FOLDER}/{name}": data for name, data in clouds.items()},
+        **{f"{OBSERVATIONS_FOLDER}/{name}": data for name, data in group.items()},
     }
 
 
