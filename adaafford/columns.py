@@ -67,7 +67,7 @@ def header_lines(data: bytes) -> Iterator[tuple[list[str], int]]:
 def whole_number(word: str, what: str) -> int:
     """A count that a header gives."""
     if not re.fullmatch(r"[0-9]{1,18}", word):
-        raise ValueError(f"{what} is {shown([word])!r}, which is no count")
+        raise ValueError(f"{what} is '{shown([word])}', which is no count")
     return int(word)
 
 
@@ -110,13 +110,13 @@ def numbers_of(text: bytes, start: int, most: int) -> tuple[Float, str]:
 def number_of(word: bytes) -> float:
     """The number that a word in text is; Python alone would read 0.9_3 as 0.93."""
     if b"_" in word:
-        raise ValueError(f"{shown([word.decode('latin-1')])!r} is no number")
+        raise ValueError(f"'{shown([word.decode('latin-1')])}' is no number")
     return float(word)
 
 
 def too_few(announced: int, held: int, what: str, word: str = "") -> ValueError:
     """The error of a file that ends early, or at a word that is no number."""
-    reason = f" before {shown([word])!r}, which is no number" if word else ""
+    reason = f" before '{shown([word])}', which is no number" if word else ""
     return ValueError(f"announces {announced} {what} and holds {held}{reason}")
 
 

@@ -63,7 +63,7 @@ def read_pcd(data: bytes) -> Columns:
     readers = {"ascii": _from_text, "binary": _from_rows, "binary_compressed": _from_compressed}
     encoding = " ".join(header["DATA"])
     if encoding not in readers:
-        raise ValueError(f"its DATA is {shown([encoding])!r}; known: {' '.join(readers)}")
+        raise ValueError(f"its DATA is '{shown([encoding])}'; known: {' '.join(readers)}")
     found = cloud_of([field.name for field in fields], readers[encoding](data, start, fields, points))
     if "VIEWPOINT" in header:
         found["camera"] = _viewpoint(header["VIEWPOINT"])
@@ -79,7 +79,7 @@ def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
         # Files of version 0.5 have COLUMNS.
         keyword = "FIELDS" if words[0].upper() == "COLUMNS" else words[0].upper()
         if keyword not in _KEYWORDS:
-            raise ValueError(f"its header has the line {shown([' '.join(words)])!r}")
+            raise ValueError(f"its header has the line '{shown([' '.join(words)])}'")
         entries[keyword] = words[1:]
         if keyword == "DATA":
             return entries, end
@@ -98,8 +98,8 @@ def _fields(header: dict[str, list[str]]) -> list[_Field]:
     for name, size, kind, count in zip(names, sizes, kinds, counts, strict=True):
         # The Point Cloud Library reads types in either case.
         if kind.upper() + size not in _SCALARS:
-            raise ValueError(f"its field {shown([name])!r} is of TYPE {shown([kind])!r} and SIZE {shown([size])!r}")
-        fields.append(_Field(name, f"<{kind.lower()}{size}", whole_number(count, f"the COUNT of {shown([name])!r}")))
+            raise ValueError(f"its field '{shown([name])}' is of TYPE '{shown([kind])}' and SIZE '{shown([size])}'")
+        fields.append(_Field(name, f"<{kind.lower()}{size}", whole_number(count, f"the COUNT of '{shown([name])}'")))
         if name in KNOWN and fields[-1].count != 1:
             raise ValueError(f"its field {name!r} has {fields[-1].count} values a point")
     return fields
@@ -120,7 +120,7 @@ def _viewpoint(words: list[str]) -> NDArray[np.float64]:
     try:
         return np.array([number_of(word.encode("latin-1")) for word in words[:3]])
     except ValueError:
-        raise ValueError(f"its VIEWPOINT is {shown(words)!r}, which are no numbers") from None
+        raise ValueError(f"its VIEWPOINT is '{shown(words)}', which are no numbers") from None
 
 
 def _from_text(data: bytes, start: int, fields: list[_Field], points: int) -> _Column:

@@ -58,7 +58,7 @@ class _Element:
     @property
     def rows(self) -> str:
         """What its rows are called in a message."""
-        return "vertices" if self.name == "vertex" else f"rows of element {shown([self.name])!r}"
+        return "vertices" if self.name == "vertex" else f"rows of element '{shown([self.name])}'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,13 +119,13 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
                 pass
             case ["format", name, *_]:
                 if name.lower() not in _ORDERS:
-                    raise ValueError(f"its format is {shown([name])!r}; known: {' '.join(_ORDERS)}")
+                    raise ValueError(f"its format is '{shown([name])}'; known: {' '.join(_ORDERS)}")
                 order = _ORDERS[name.lower()]
             case ["element", name, count] if len(elements) < _MAX_ELEMENTS:
                 name = name.lower()
                 if any(each.name == name for each in elements):
-                    raise ValueError(f"has the element {shown([name])!r} twice")
-                elements.append(_Element(name, whole_number(count, f"the count of element {shown([name])!r}"), []))
+                    raise ValueError(f"has the element '{shown([name])}' twice")
+                elements.append(_Element(name, whole_number(count, f"the count of element '{shown([name])}'"), []))
             case ["property", "list" | "LIST", length_kind, kind, name] if _has_room(elements):
                 elements[-1].properties.append(_Property(name, _kind(kind, name), _kind(length_kind, name)))
             case ["property", kind, name] if _has_room(elements):
@@ -135,7 +135,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
             case ["end_header"]:
                 raise ValueError("its header has no line 'format'")
             case _:
-                raise ValueError(f"its header has the line {shown([' '.join(words)])!r}")
+                raise ValueError(f"its header has the line '{shown([' '.join(words)])}'")
     raise AssertionError("header_lines raises where a header does not end")
 
 
@@ -146,7 +146,7 @@ def _has_room(elements: list[_Element]) -> bool:
 
 def _kind(name: str, of: str) -> str:
     if name.lower() not in _KINDS:
-        raise ValueError(f"its property {shown([of])!r} has the type {shown([name])!r}; known: {' '.join(_KINDS)}")
+        raise ValueError(f"its property '{shown([of])}' has the type '{shown([name])}'; known: {' '.join(_KINDS)}")
     return _KINDS[name.lower()]
 
 

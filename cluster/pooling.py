@@ -112,7 +112,8 @@ class PooledRow:
             flat |= {name: value, f"{name}_low": low, f"{name}_high": high}
             flat |= {f"{name}_run_{run}": each for run, each in enumerate(self.by_run[name], start=1)}
         flat |= {f"paper_{name}": None if value is None else value / 100 for name, value in self.paper.items()}
-        return finite(flat | {"gap_closed": self.gap_closed, "trials": self.trials} | dict(self.averages))
+        flat |= {"gap_closed": self.gap_closed, "trials": self.trials} | dict(self.averages)
+        return {name: finite(value) for name, value in flat.items()}
 
 
 @dataclass(frozen=True, slots=True)

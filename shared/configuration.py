@@ -247,7 +247,7 @@ def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
 def _shown(value: object) -> str:
     """A value as a message has it; an integer of thousands of digits cannot be written."""
     try:
-        return repr(plain(str(value), MAX_WORD))
+        return f"'{plain(str(value), MAX_WORD)}'"
     except (ValueError, RecursionError):
         return f"a value of type {type(value).__name__}"
 

@@ -469,7 +469,7 @@ HOSTILE: dict[str, tuple[bytes, str]] = {
     "lists.ply": (b"ply\nformat ascii 1.0\n" + FACES + b"element vertex 9\nend_header\n-1\n", "a list of -1 values"),
     "nan-list.ply": (b"ply\nformat ascii 1.0\n" + FACES + b"element vertex 9\nend_header\nnan\n", "a list of nan"),
     "long-list.ply": (b"ply\nformat ascii 1.0\n" + FACES + b"element vertex 9\nend_header\n1e9\n", "a list of 1e+09"),
-    "escape.ply": (ply(front()).replace(b"property float x", b"\x1b[31mx"), "its header has the line '?[31mx'"),
+    "escape.ply": (ply(front()).replace(b"property float x", b"\x1b[31mx"), r"its header has the line '\x1b[31mx'"),
     # PCD.
     "header.pcd": (b"FIELDS x y z\n" * 2000, "is cut off: its 26000 bytes"),
     "endless.pcd": (b"FIELDS x y z\n" * 90_000, "does not end within 1048576 bytes"),

@@ -205,7 +205,7 @@ def changed(shard: Path, name: str, value: Any, file: str = "interactions.parque
         ("order", "", "column order holds ''"),
         ("target_link", "x" * 1000, "text of 1000 characters"),
         ("object_id", "x" * 3_000_000, "text of 3000000 characters|unpacks to more than"),
-        ("proposer", "a\x1b[2Jb", "'a.\\[2Jb'"),
+        ("proposer", "a\x1b[2Jb", r"'a\\x1b\[2Jb'"),
         ("joint_names", "[" * 20_000, "not a record|recursion"),
         ("joint_names", '{"a": 1}', "joint_names is no list of names"),
         ("joint_names", "[[]]", "joint_names is no list of names"),
