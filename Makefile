@@ -51,13 +51,14 @@ format: $(STAMP)  ## Put the code in its form.
 	$(BIN)/ruff check --fix .
 
 bench: $(STAMP)  ## Fidelity, dynamics and speed of push and pull, and of learning, into dated files; OBJECTS=FOLDER for real objects.
-	@for task in push pull; do for what in "fidelity --trials 500" dynamics "collect --workers 2"; do \
-	  echo "== bench $$what, $$task"; \
-	  $(BIN)/adaafford bench $$what --task $$task $(if $(OBJECTS),--objects $(OBJECTS)) --out benchmarks || exit 1; \
-	done; done
-	$(BIN)/adaafford bench store --out benchmarks
-	$(BIN)/adaafford bench learner --out benchmarks
-	$(BIN)/adaafford bench adapt --out benchmarks
+	@for task in push pull; do \
+	  for what in "adaafford bench fidelity --trials 500" "adaafford bench dynamics" \
+	      "adaafford bench collect --workers 2" "python -m benchmarks.published"; do \
+	    echo "== $$what, $$task"; \
+	    $(BIN)/$$what --task $$task $(if $(OBJECTS),--objects $(OBJECTS)) --out benchmarks || exit 1; \
+	  done; \
+	done
+	@for name in storing learning adapting; do $(BIN)/python -m benchmarks.$$name --out benchmarks || exit 1; done
 
 clean:  ## Remove the environment, caches and runs/.
 	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -7,6 +7,9 @@ A robot's author implements `Environment` over a camera and an arm, and lets the
 >>> while (action := proposer.propose(observation := robot.observe(), history)) is not None:
 ...     history.append(Interaction(observation, action, robot.execute(action)))
 >>> heat = adapter.affordance(robot.observe(), history)      # [N], where the part can be moved
+
+`collect` and `train` do what the commands of these names do; `simulated` gives simulated objects to try a policy on.
+Collecting and simulating need `pip install 'adaafford[collect]'`; nothing of that is imported before they are used.
 """
 
 from importlib import import_module
@@ -19,8 +22,10 @@ require_own_packages()
 __version__ = version("adaafford")
 
 if TYPE_CHECKING:
+    from adaafford.heatmaps import write_heatmap
     from adaafford.pretrained import load_policy
     from adaafford.scans import ScanFrame, checked_scan, doubtful_up, observation_of, read_scan
+    from cluster.library import collect, simulated, train
     from shared.adaptation import Adapter
     from shared.errors import AdaAffordError
     from shared.policy import Policy
@@ -40,8 +45,10 @@ if TYPE_CHECKING:
 else:
     # Imported when it is first asked for: the command line begins here, too, and its help is not to wait for PyTorch.
     _HOMES = {
+        "adaafford.heatmaps": ("write_heatmap",),
         "adaafford.pretrained": ("load_policy",),
         "adaafford.scans": ("ScanFrame", "checked_scan", "doubtful_up", "observation_of", "read_scan"),
+        "cluster.library": ("collect", "simulated", "train"),
         "shared.adaptation": ("Adapter",),
         "shared.errors": ("AdaAffordError",),
         "shared.policy": ("Policy",),
@@ -85,9 +92,13 @@ __all__ = [
     "Store",
     "__version__",
     "checked_scan",
+    "collect",
     "doubtful_up",
     "load_policy",
     "observation_of",
     "open_store",
     "read_scan",
+    "simulated",
+    "train",
+    "write_heatmap",
 ]

@@ -44,7 +44,7 @@ COMMANDS = {
     "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
     "store": "info, verify, digest, replay, repair, compact, merge, export, migrate or check-place: look after stores",
     "objects": "generate, check, preview or decompose: the objects",
-    "bench": "fidelity, dynamics, collect, store, scale, learner, adapt or hints: how fast and how true each part is",
+    "bench": "fidelity, dynamics, collect or learner: measure what helps to choose settings",
     "version": "print the version",
 }
 """Subcommands, each a module of `cluster.commands` with `main(args) -> int`."""

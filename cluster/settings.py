@@ -127,15 +127,29 @@ def early_flags(args: list[str], *names: str) -> dict[str, str | None]:
     return vars(known)
 
 
-def parse_flags(command: type[Command], args: list[str], prog: str, default: Command | None = None) -> Command:
+def parse_flags(
+    command: type[Command],
+    args: list[str],
+    prog: str,
+    default: Command | None = None,
+    *,
+    program: str = "adaafford ",
+) -> Command:
     """Parse `args` as `command`; a mistake in the flags themselves ends the process with code 2.
+
+    Args:
+        command: declares the flags.
+        args: what was given.
+        prog: the subcommand, for the usage text.
+        default: values of flags that are not given.
+        program: what stands before the subcommand in the usage text.
 
     Raises:
         UsageError: a value is of the right type but not allowed.
     """
     try:
         parsed = tyro.cli(
-            command, prog=f"adaafford {prog}", args=args, default=default, config=FLAG_STYLE, registry=FLAG_TYPES
+            command, prog=f"{program}{prog}", args=args, default=default, config=FLAG_STYLE, registry=FLAG_TYPES
         )
     except ValidationError as error:
         problem = error.errors()[0]

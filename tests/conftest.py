@@ -45,7 +45,7 @@ def real_objects() -> Path:
 @pytest.fixture(scope="session")
 def s3_endpoint() -> Iterator[str]:
     """Address of an S3 server on loopback that lives as long as the tests."""
-    from cluster.benchmarks.s3_server import loopback_server
+    from benchmarks.s3_server import loopback_server
 
     with loopback_server() as endpoint:
         yield endpoint

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from cluster.benchmarks import learning, straightforward
-from cluster.benchmarks.adapting import SIZES, resized
-from cluster.benchmarks.learning import PARTS, StepApart, stages_of
-from cluster.benchmarks.straightforward import PublishedEncoder, PublishedStep, ball_neighbours, furthest_points
+from benchmarks import adapting, learning, straightforward
+from benchmarks.adapting import SIZES, AdaptSettings, resized
+from benchmarks.learning import PARTS, LearningSettings, StepApart
+from benchmarks.script import run_script
+from benchmarks.straightforward import PublishedEncoder, PublishedStep, ball_neighbours, furthest_points
+from cluster.benchmarks.learning import NETWORKS as CRITICS
+from cluster.benchmarks.learning import stages_of
 from cluster.cli import run
+from learner import configuration
 from learner.configuration import AapConfig, AipConfig, LearnerConfig, PriorConfig
 from learner.data import load_dataset, split
 from shared.networks.configuration import NETWORKS
@@ -90,19 +94,25 @@ def test_the_benches_end_in_one_object(
     monkeypatch.setattr(learning, "POINTS", 1100)
     monkeypatch.setattr(straightforward, "POINTS", 1100)
     small = LearnerConfig(network=TINY, prior=PriorConfig(proposals=4))
-    monkeypatch.setattr("learner.configuration.LearnerConfig", lambda seed: small.model_copy(update={"seed": seed}))
+    for module in (learning, configuration):
+        monkeypatch.setattr(module, "LearnerConfig", lambda **settings: small.model_copy(update=settings))
     told = ["--store", str(store.path), "--repeats", "1", "--json", "--out", str(tmp_path)]
-    assert run(["bench", "learner", *told, "--steps", "2", "--port-interactions", "2"]) == 0
+    assert run(["bench", "learner", *told, "--steps", "2", "--batch-rollouts", "3"]) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert all(found[f"{name.replace('-', '_')}_interactions_per_second"] > 0 for name in CRITICS)
+    assert found["batch_rollouts"] == 3
+    steps = ["--steps", "2", "--port-interactions", "2"]
+    assert run_script("learning", LearningSettings, learning.measure, [*told, *steps]) == 0
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert found["aap_interactions_per_second"] > 0
     ratio = found["aap_interactions_per_second"] / found["straightforward_port_interactions_per_second"]
     assert found["times_straightforward_port"] == pytest.approx(ratio)
     assert {tuple(parts) for parts in found["step_seconds"].values()} == {PARTS}
-    assert run(["bench", "adapt", *told]) == 0
+    assert run_script("adapting", AdaptSettings, adapting.measure, told) == 0
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert list(found["milliseconds"]) == [str(size) for size in SIZES]
     assert found["step_ms"] > 0
-    assert len(list(tmp_path.glob("*.json"))) == 2
+    assert len(list(tmp_path.glob("*.json"))) == 3
 
 
 def test_a_resized_observation_keeps_its_first_points(store: Store) -> None:

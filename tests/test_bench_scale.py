@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from cluster.benchmarks.listing import ListingBenchmark, StorePoint
-from cluster.benchmarks.scaling import FleetPoint, Line, Wish, predict, predictions
-from cluster.benchmarks.scaling_figure import draw
-from cluster.benchmarks.sleeping import Dormitory, Sleeper
-from cluster.cli import run
+from benchmarks.listing import ListingBenchmark, StorePoint
+from benchmarks.scaling import FleetPoint, Line, ScaleSettings, Wish, measure, predict, predictions
+from benchmarks.scaling_figure import draw
+from benchmarks.script import run_script
+from benchmarks.sleeping import Dormitory, Sleeper
 from shared.plan import Job, Plan
 from shared.store import Store
 from tests.fabricate import fabricate_rollouts, fabricate_setting
@@ -19,6 +19,10 @@ from tests.fabricate import fabricate_rollouts, fabricate_setting
 SETTING = fabricate_setting()
 PLAN = Plan(setting=SETTING)
 WISH = Wish(actors=1000, interactions=10**6, per_rollout=32, interactions_per_s=100.0)
+
+
+def scale(*args: str) -> int:
+    return run_script("scaling", ScaleSettings, measure, list(args))
 
 
 def point(job_s: float, driver_ms: float) -> FleetPoint:
@@ -101,13 +105,13 @@ def test_guests_of_one_process_sleep_at_the_same_time_and_each_does_its_jobs_in_
 
 
 def test_sizes_out_of_order_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["bench", "scale", "--shards", "100", "10"]) == 2
+    assert scale("--shards", "100", "10") == 2
     assert "in order" in capsys.readouterr().err
 
 
 def test_a_figure_that_cannot_be_kept_is_refused_beforehand(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for figure in (tmp_path, tmp_path / "figure.foo", tmp_path / "nowhere" / "figure.png"):
-        assert run(["bench", "scale", "--figure", str(figure)]) == 2
+        assert scale("--figure", str(figure)) == 2
         assert f"--figure {figure}: " in capsys.readouterr().err
 
 
@@ -115,7 +119,7 @@ def test_a_figure_that_cannot_be_kept_is_refused_beforehand(capsys: pytest.Captu
 def test_the_benchmark_from_end_to_end(tmp_path: Path, template: Store, capsys: pytest.CaptureFixture[str]) -> None:
     sizes = ["--actors", "5", "120", "--processes", "2", "--shards", "10", "20", "--seconds", "1"]
     out = ["--figure", str(tmp_path / "figure.png"), "--out", str(tmp_path), "--json"]
-    assert run(["bench", "scale", "--store", str(template.path), *sizes, *out]) == 0
+    assert scale("--store", str(template.path), *sizes, *out) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert [(each["kind"], each["actors"]) for each in result["fleets"]] == [
         ("guest", 5),

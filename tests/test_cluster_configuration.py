@@ -3,13 +3,14 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import pytest
 import tyro
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cluster.cli import run
 from cluster.configuration import EXECUTION_SETTINGS, CampaignConfig, RolloutCounts
 from cluster.evaluation_settings import EvaluateSettings
 from cluster.run_folder import begin, find
@@ -50,6 +51,7 @@ def test_early_flags_are_found_among_others() -> None:
 class Evaluation:
     settings: Annotated[EvaluateSettings, tyro.conf.arg(name="")] = EvaluateSettings()
     runs: tuple[Path, ...] = ()
+    sides: tuple[Literal["left", "right"], ...] = ()
 
 
 @pytest.mark.parametrize("budgets", [["1,2,4"], ["1", "2", "4"], ["1,2", "4"]])
@@ -62,13 +64,18 @@ def test_lists_are_divided_by_commas_or_spaces(budgets: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("flags", "expected"), [(["--budgets", "1,x"], "'x'"), (["--methods", "ours-final,hers"], "invalid choice 'hers'")]
+    ("flags", "expected"), [(["--budgets", "1,x"], "'x'"), (["--sides", "left,up"], "invalid choice 'up'")]
 )
 def test_a_wrong_word_in_a_list_is_named(flags: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         parse_flags(Evaluation, flags, "evaluate", Evaluation())
     assert stop.value.code == 2
     assert expected in capsys.readouterr().err
+
+
+def test_an_unknown_method_is_named_before_a_run_is_looked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["evaluate", "--run", "none", "--methods", "ours-final,hers"]) == 2
+    assert "unknown method 'hers'; allowed: where2act, " in capsys.readouterr().err
 
 
 values = st.recursive(st.integers(0, 2), lambda inner: st.dictionaries(st.sampled_from("abc"), inner), max_leaves=6)

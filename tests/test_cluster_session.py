@@ -149,13 +149,16 @@ def test_a_private_session_is_private_whatever_the_environment_says(scratch: Pat
         assert each["stranger"].startswith("1  ") and "AuthenticationError" in each["stranger"]
 
 
-def test_benchmarks_import_ray_without_foreign_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    def look(args: list[str]) -> int:
-        return sum(name.startswith("RAY_") for name in os.environ)
+def test_benchmarks_import_ray_without_foreign_settings(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def look(settings: object) -> dict[str, object]:
+        return {"settings of Ray": sum(name.startswith("RAY_") for name in os.environ)}
 
     monkeypatch.setenv("RAY_NUM_REDIS_GET_RETRIES", "many")
-    monkeypatch.setattr("cluster.commands.bench_scale.scale", look)
-    assert bench.main(["scale"]) == 0
+    monkeypatch.setitem(bench.BENCHMARKS, "collect", (bench.CollectSettings, look))
+    assert bench.main(["collect", "--json"]) == 0
+    assert '"settings of Ray": 0' in capsys.readouterr().out
     assert os.environ["RAY_NUM_REDIS_GET_RETRIES"] == "many"
 
 

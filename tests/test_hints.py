@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cluster.benchmarks.hinting import distance_from_axis, hints_of
-from cluster.cli import run
+from benchmarks.hinting import HintSettings, distance_from_axis, hints_of, measure
+from benchmarks.script import run_script
 from shared.plan import Job, Plan
 from shared.records import InteractionRecord, RolloutRecord
 from shared.vocabulary import Float32, Interaction, Observation, Outcome, OutcomeKind
@@ -31,6 +31,10 @@ def test_points_of_a_hinged_part_move_as_fast_as_they_are_far_from_its_axis(
     moment = -np.cross(axis, through)
     speeds = np.linalg.norm(np.cross(axis, points) + moment, axis=1)
     assert distance_from_axis(points, axis, moment) * np.linalg.norm(axis) == pytest.approx(speeds, abs=1e-9)
+
+
+def hints(*args: str) -> int:
+    return run_script("hinting", HintSettings, measure, list(args))
 
 
 def a_door_hung_at_the_left() -> RolloutRecord:
@@ -96,9 +100,9 @@ def test_the_command_counts_tries_and_draws_them(tmp_path: Path, capsys: pytest.
         (["--picture", str(tmp_path / "nowhere" / "hints.png")], "its folder is not there"),
         (["--picture", str(tmp_path)], "give the name of a PNG file"),
     ):
-        assert run(["bench", "hints", *flags, *bad]) == 2
+        assert hints(*flags, *bad) == 2
         assert message in capsys.readouterr().err.splitlines()[-1]
-    assert run(["bench", "hints", *flags, "--json"]) == 0
+    assert hints(*flags, "--json") == 0
     printed = capsys.readouterr().out
     cases = json.loads(printed.splitlines()[-1])["cases"]
     assert sum(figures["tries"] for figures in cases.values()) > 0
@@ -111,8 +115,8 @@ def test_the_command_counts_tries_and_draws_them(tmp_path: Path, capsys: pytest.
 def test_a_policy_of_another_task_is_refused_before_anything_is_tried(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cluster.commands.bench_hints.stored", lambda _: pytest.fail("a store was made"))
-    assert run(["bench", "hints", "--task", "push-faucet"]) == 2
+    monkeypatch.setattr("benchmarks.hinting.stored", lambda _: pytest.fail("a store was made"))
+    assert hints("--task", "push-faucet") == 2
     assert "a policy for 'pull-closed-door', but the tries are of 'push-faucet'" in capsys.readouterr().err
 
 
@@ -120,7 +124,7 @@ def test_a_policy_of_another_task_is_refused_before_anything_is_tried(
 def test_the_policy_that_comes_along_takes_a_success_on_the_free_side_for_what_it_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["bench", "hints", "--rollouts", "60", "--json", "--picture", str(tmp_path / "hints.png")]) == 0
+    assert hints("--rollouts", "60", "--json", "--picture", str(tmp_path / "hints.png")) == 0
     success = json.loads(capsys.readouterr().out.splitlines()[-1])["cases"]["success-free"]
     assert success["tries"] >= 15
     assert success["free"]["brighter"] > 0.9

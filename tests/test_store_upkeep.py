@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import zarr
 
-from cluster.benchmarks.storing import StoringBenchmark
+from benchmarks.storing import StoringBenchmark
 from cluster.cli import run
 from shared.errors import StoreError, UsageError
 from shared.observation import pack_normals

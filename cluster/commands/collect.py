@@ -16,7 +16,6 @@ from shared.configuration import CollectionConfig
 from shared.errors import StoreError, UsageError
 from shared.methods import RANDOM, needs_policy
 from shared.plan import ROLLOUTS_PER_SHARD
-from shared.tasks import Task
 
 if TYPE_CHECKING:
     from shared.plan import ObjectRef
@@ -77,14 +76,14 @@ def main(args: list[str]) -> int:
     config = Path(early["config"]) if early["config"] else None
     defaults = CollectCommand(layered(CollectSettings, None, config), tyro.MISSING, config=config)
     command = parse_flags(CollectCommand, args, "collect", defaults)
-    task = command.settings.task_record
+    _ = command.settings.task_record
     learnt = needs_policy(command.proposer)
     if learnt != (command.policy == "latest" or command.policy > 0):
         wanted = "needs --policy VERSION (1 or more, or latest)" if learnt else "takes no --policy"
         raise UsageError(f"the proposer '{command.proposer}' {wanted}")
     if command.settings.per_version is not None and command.policy != "latest":
         raise UsageError("--per-version is about the versions of --policy latest; without that, give --rollouts alone")
-    _collect(command, task)
+    run_collection(command)
     return 0
 
 
@@ -107,7 +106,8 @@ def _begun_with(where: str, found: "tuple[ObjectRef, ...]") -> "tuple[ObjectRef,
     return known
 
 
-def _collect(command: CollectCommand, task: Task) -> None:
+def run_collection(command: CollectCommand) -> None:
+    """Collect what is left of a command that was checked."""
     from cluster.collection import Newest, collect
     from cluster.fleet import make_worker
     from cluster.objects import objects_for
@@ -120,6 +120,7 @@ def _collect(command: CollectCommand, task: Task) -> None:
     from shared.store.provenance import changed_versions
 
     chosen, where = command.settings, absolute(command.store)
+    task = chosen.task_record
     packages_used(task, chosen.collection)  # Refused before any object is read.
     catalogue, folder = objects_for(
         task,

@@ -51,7 +51,7 @@ def loopback_server() -> Iterator[str]:
     """
     if importlib.util.find_spec("moto") is None:
         raise UsageError("an S3 server on loopback needs the development dependencies; install adaafford[dev]")
-    command = [*PYTHON, "-m", "cluster.benchmarks.s3_server"]
+    command = [*PYTHON, __file__]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=own_environment()) as server:
         assert server.stdin is not None

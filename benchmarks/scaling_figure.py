@@ -1,11 +1,11 @@
-"""A picture of `adaafford bench scale`: what was measured, and where it leads."""
+"""A picture of `benchmarks.scaling`: what was measured, and where it leads."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cluster.benchmarks.scaling import Line
+from benchmarks.scaling import Line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

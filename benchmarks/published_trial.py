@@ -1,6 +1,6 @@
-"""The published protocol as its authors run it: one process and one scene for every trial. Only benchmarks use it.
+"""The published protocol as its authors run it: one process and one scene for every trial.
 
-`python -m collector.published` reads one `PublishedRequest` as JSON from standard input, and prints one
+This file as a process reads one `PublishedRequest` as JSON from standard input, and prints one
 `PublishedTiming` as JSON. Facts of Where2Act's public code that cost time and are kept: the object settles until it was
 still for 5,000 steps of at most 20,000, with contacts read at every step; each step of a leg computes joint velocities
 by the pseudo-inverse of the hand's Jacobian and sets every joint's drive anew; each step of a hold computes passive

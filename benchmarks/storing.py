@@ -12,15 +12,48 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cluster.benchmarks.s3_server import loopback_bucket
+from pydantic import Field
+
+from benchmarks.s3_server import loopback_bucket
+from benchmarks.script import main
+from cluster.commands.bench import StoredSettings, source_of, stored
 from shared.errors import StoreError
 from shared.plan import Job
-from shared.progress import Advance
+from shared.progress import Advance, Progress
 from shared.records import RolloutRecord
 from shared.store import Store, info
 from shared.store.layout import MAX_DOCUMENT_BYTES, SHARDS_FOLDER
 
 MAX_FILE_BYTES = 1 << 30
+
+
+class StoreSettings(StoredSettings):
+    """Time commits, and reading everything again from a cold and a warm disk and from a bucket, beside raw reading."""
+
+    repeats: int = Field(3, ge=1, le=1000)
+    """The median of these counts."""
+    bucket: bool = True
+    """Whether a bucket is measured as well, on an S3 server that is started on loopback for it."""
+
+
+def measure(command: StoreSettings) -> dict[str, Any]:
+    """Measure, and print a table."""
+    with stored(command) as source:
+        benchmark = StoringBenchmark(source, command.repeats, command.bucket)
+        with Progress("turns of writing and reading", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
+        result = benchmark.as_json() | source_of(command, source)
+    print(f"{result['interactions']} interactions in {result['shards']} shards, {command.repeats} times; medians")
+    print(f"  bytes an interaction  {result['bytes_per_interaction']:.0f}")
+    for name, cost in result["commit_ms_per_shard"].items():
+        each = result["commit_ms_per_interaction"][name]
+        print(f"  commit, {name:<13} {cost:.1f} ms a shard, {each:.2f} ms an interaction")
+    print(f"  {'reading':<14}{'interactions/s':>15}{'MB/s':>8}{'raw MB/s':>10}{'times raw':>11}")
+    for name, figures in result["read"].items():
+        rate, speed = figures["interactions_per_second"], figures["megabytes_per_second"]
+        raw = figures["raw_megabytes_per_second"]
+        print(f"  {name:<14}{rate:>15,.0f}{speed:>8.1f}{raw:>10.1f}{figures['times_raw']:>11.1f}")
+    return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,3 +173,7 @@ def _seconds(act: Callable[[], object]) -> float:
     begun = time.perf_counter()
     act()
     return time.perf_counter() - begun
+
+
+if __name__ == "__main__":
+    main("storing", StoreSettings, measure)

@@ -12,12 +12,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydantic import Field
 
+from benchmarks.script import main
+from cluster.commands.bench import StoredSettings, source_of, stored
 from shared.adaptation import Adapter
 from shared.errors import UsageError
+from shared.networks.configuration import NetworkConfig
 from shared.observation import round_points
 from shared.policy import Policy
-from shared.progress import Advance
+from shared.progress import Advance, Progress
 from shared.proposers import AipProposer
 from shared.store import Store
 from shared.vocabulary import Interaction, Observation, Outcome, OutcomeKind
@@ -28,6 +32,29 @@ BUDGET = 4
 """Tries in one rollout."""
 SPREAD = 0.003
 """Standard deviation, in the cloud's units, of a point that is added from one that is there."""
+
+
+class AdaptSettings(StoredSettings):
+    """Time a test-time step: AIP proposes, the outcome is added, and the adapted affordance is computed."""
+
+    repeats: int = Field(5, ge=1, le=1000)
+    """The median of these counts."""
+
+
+def measure(command: AdaptSettings) -> dict[str, Any]:
+    """Measure, and print a table."""
+    with stored(command) as store:
+        policy = Policy.untrained(store.setting.task, NetworkConfig(), command.seed)
+        benchmark = AdaptationBenchmark(store, policy, command.repeats)
+        with Progress("rollouts of test-time steps", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
+        result = benchmark.as_json() | source_of(command, store)
+    print(f"{result['steps']} steps at each size, {result['threads']} threads; medians in ms")
+    print(f"  {'points':>7}{'propose':>9}{'update':>9}{'step':>9}{'known observation':>20}")
+    for size, figures in result["milliseconds"].items():
+        known = figures["step_at_known_observation"]
+        print(f"  {size:>7}{figures['propose']:>9.1f}{figures['update']:>9.1f}{figures['step']:>9.1f}{known:>20.1f}")
+    return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,3 +181,7 @@ def resized(observation: Observation, size: int) -> Observation:
         movable=observation.movable[index],
         pixels=observation.pixels[index],
     )
+
+
+if __name__ == "__main__":
+    main("adapting", AdaptSettings, measure)

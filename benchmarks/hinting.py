@@ -6,6 +6,7 @@ are told by the stored axis of the hinge, which no network sees.
 Shapes: P points of a door.
 """
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,14 +14,20 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from adaafford import load_policy
+from benchmarks.script import check_picture, main
+from cluster.adoption import seen_by, unknown
+from cluster.commands.bench import StoredSettings, source_of, stored
 from cluster.picture import Panel, draw_panels
 from cluster.reporting.words import verdict
 from learner.bootstrap import ratio_interval
 from shared.adaptation import Adapter
 from shared.errors import UsageError
+from shared.formatting import percent
 from shared.policy import Policy
-from shared.progress import Advance
+from shared.progress import Advance, Progress
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
 from shared.vocabulary import Float, Float32, Interaction, Observation, Outcome
@@ -34,6 +41,49 @@ RANDOM = "random"
 """The proposer whose tries count: what a network proposed says as much of the network as of the door."""
 DRAWN = 4
 """Objects in a picture."""
+
+
+class HintSettings(StoredSettings):
+    """Say what a single try does to the affordance near a door's hinge, and far from it."""
+
+    task: str = "pull-closed-door"
+    """Of the store that is made where none is given; its parts must turn."""
+    seed: int = Field(1_000, ge=0, lt=2**63)
+    """Of the store that is made: not the training's, whose built-in objects would be the same."""
+    procedural_per_category: int = Field(40, ge=1, le=10_000)
+    """Its built-in objects: how many of each category that the task applies to."""
+    rollouts: int = Field(120, ge=2, le=1_000_000)
+    """Of the store that is made."""
+    policy: str = "pull-closed-door"
+    """Whose heatmaps: a name of those that the package brings, a folder, or a run."""
+    picture: Path | None = None
+    """A PNG of the first four objects before and after a success on the free side."""
+
+
+def measure(command: HintSettings) -> dict[str, Any]:
+    """Measure, and print a table."""
+    policy = load_policy(command.policy)
+    check_picture("--picture", command.picture)
+    if command.store is None:
+        fit_for_hints(policy, command.task)
+    if not (seen := seen_by(command.policy)):
+        print(f"--policy {unknown(command.policy)}", file=sys.stderr)
+    with stored(command) as store:
+        benchmark = HintBenchmark(store, policy, seen)
+        with Progress("shards of hints", benchmark.turns) as progress:
+            benchmark.run(progress.advance)
+        result = benchmark.as_json() | source_of(command, store) | {"policy": command.policy}
+    print("affordance of a door's free and hinge side before and after one random try, and in how many it rose")
+    for case, figures in result["cases"].items():
+        told, side = case.split("-")
+        print(f"  {told} on the {side} side: {figures['tries']} tries of {figures['objects']} objects")
+        for name in get_args(Side):
+            of = figures[name]
+            rose = percent(of["brighter"], of["brighter_interval"], decimals=0)
+            print(f"    {name:<6}{of['before']:.3f} -> {of['after']:.3f}, rose in {rose}%")
+    if command.picture is not None and draw_hints(benchmark.hints, policy.task, command.picture):
+        print(f"drawn in {command.picture}", file=sys.stderr)
+    return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,3 +280,7 @@ def draw_hints(hints: Sequence[Hint], title: str, out: Path) -> bool:
     except OSError as error:
         raise UsageError(f"{out}: cannot be written ({error.strerror}); name another file") from None
     return True
+
+
+if __name__ == "__main__":
+    main("hinting", HintSettings, measure)
