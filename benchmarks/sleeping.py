@@ -23,7 +23,7 @@ from shared.plan import Job, Plan
 
 INTERACTIONS = 32
 """Of a rollout, as by default."""
-STAGES = ("load", "camera", "propose", "physics", "write")
+STAGES = ("load", "settle", "observe", "propose", "simulate", "write")
 """Named so that receipts are as large as those of a collector."""
 
 

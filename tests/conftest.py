@@ -12,6 +12,8 @@ from pathlib import Path  # noqa: E402
 
 import pytest  # noqa: E402
 
+pytest.register_assert_rewrite("tests.support")
+
 OBJECTS_VARIABLE = "ADAAFFORD_OBJECTS"
 BESIDE = Path(__file__).parents[2] / "shared" / "partnet_mobility"
 """Where real objects are looked for when the variable is unset: beside the checkout."""

@@ -12,6 +12,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -53,37 +54,73 @@ NETWORK = NetworkConfig(
 
 
 def main() -> None:
-    """Try the mutants that the command line names."""
-    scratch, seed, start, stop, kind = sys.argv[1:]
-    make, read, repair_too = {
-        "store": (make_store, read_store, repair_store),
-        "policy": (make_policy, read_policy, None),
-        "run": (make_run, read_run, None),
-    }[kind]
-    sound, path = Path(scratch) / "sound", Path(scratch) / "x"
-    make(sound)
-    shutil.copytree(sound, path)
-    assert verdict(lambda: read(path)) == "survived", verdict(lambda: read(path))
-    files = sorted(file.relative_to(path) for file in path.rglob("*") if file.is_file() and file.name[0] != ".")
-    if kind == "store":
-        files = [file for file in files if "00000002-" not in str(file)]
+    """Try the mutants that the command line names; of several kinds, each comes in its turn."""
+    scratch, seed, start, stop, *kinds = sys.argv[1:]
+    subjects = [Subject.make(kind, Path(scratch) / kind) for kind in kinds]
     limit_memory()
     for number in range(int(start), int(stop)):
-        rng = np.random.default_rng([int(seed), number])
-        # Of a store's many files, those of each kind come equally often.
-        name = pick(rng, sorted({file.name for file in files}))
-        file = path / pick(rng, [file for file in files if file.name == name])
-        print(f"begin {number} {file.relative_to(path)}", flush=True)
+        subject = subjects[number % len(kinds)]
+        rng = np.random.default_rng([int(seed), number // len(kinds)])
+        file = subject.choose(rng)
+        print(f"begin {number} {file.relative_to(subject.path)}", flush=True)
         begun = time.perf_counter()
-        damage(path, file, rng)
-        result = verdict(lambda: read(path))
-        if repair_too is not None and result.startswith("refused") and rng.random() < 0.1:
-            shutil.copytree(path, path.with_name("copy"), symlinks=True, copy_function=copy_or_make)
-            outcome = verdict(lambda: repair_too(path.with_name("copy")))
-            result = f"{result} (repair: {outcome})" if not outcome.startswith("failed") else outcome
-            shutil.rmtree(path.with_name("copy"))
+        result = subject.try_mutant(file, rng)
         print(f"end {number} {time.perf_counter() - begun:.2f} {result}", flush=True)
-        restore(sound, path, file.relative_to(path))
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """What is damaged, one file at a time.
+
+    Attributes:
+        sound: a folder as it should be.
+        path: its copy, which is damaged and put right again.
+        files: those that are damaged, relative to both.
+        read: messages of everything that reads it.
+        repair: messages of what is left after a repair, of what can be repaired.
+    """
+
+    sound: Path
+    path: Path
+    files: list[Path]
+    read: Callable[[Path], list[str]]
+    repair: Callable[[Path], list[str]] | None
+
+    @classmethod
+    def make(cls, kind: str, folder: Path) -> "Subject":
+        """One of a kind, which is read without a complaint."""
+        make, read, repair_too = {
+            "store": (make_store, read_store, repair_store),
+            "policy": (make_policy, read_policy, None),
+            "run": (make_run, read_run, None),
+        }[kind]
+        folder.mkdir()
+        sound, path = folder / "sound", folder / "x"
+        make(sound)
+        shutil.copytree(sound, path)
+        assert verdict(lambda: read(path)) == "survived", verdict(lambda: read(path))
+        files = sorted(file.relative_to(path) for file in path.rglob("*") if file.is_file() and file.name[0] != ".")
+        if kind == "store":
+            files = [file for file in files if "00000002-" not in str(file)]
+        return cls(sound, path, files, read, repair_too)
+
+    def choose(self, rng: np.random.Generator) -> Path:
+        """A file; of a store's many files, those of each kind come equally often."""
+        name = pick(rng, sorted({file.name for file in self.files}))
+        return self.path / pick(rng, [file for file in self.files if file.name == name])
+
+    def try_mutant(self, file: Path, rng: np.random.Generator) -> str:
+        """The verdict on one damaged file."""
+        damage(self.path, file, rng)
+        result = verdict(lambda: self.read(self.path))
+        if self.repair is not None and result.startswith("refused") and rng.random() < 0.1:
+            repair_too, copy = self.repair, self.path.with_name("copy")
+            shutil.copytree(self.path, copy, symlinks=True, copy_function=copy_or_make)
+            outcome = verdict(lambda: repair_too(copy))
+            result = f"{result} (repair: {outcome})" if not outcome.startswith("failed") else outcome
+            shutil.rmtree(copy)
+        restore(self.sound, self.path, file.relative_to(self.path))
+        return result
 
 
 def damage(path: Path, file: Path, rng: np.random.Generator) -> None:

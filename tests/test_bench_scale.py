@@ -87,20 +87,31 @@ def test_a_sleeper_leaves_breadcrumbs_and_a_receipt_of_all_its_rollouts() -> Non
     assert receipt.seconds["total"] >= 0.01
 
 
-def test_guests_of_one_process_sleep_at_the_same_time_and_each_does_its_jobs_in_turn() -> None:
-    async def night() -> tuple[float, list[str]]:
-        dormitory, woken = Dormitory(0.05), []
+def test_guests_of_one_process_sleep_at_the_same_time_and_each_does_its_jobs_in_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asleep, most, pause = 0, 0, asyncio.sleep
 
-        async def sleep(bed: int, number: int) -> None:
+    async def sleep(seconds: float) -> None:
+        nonlocal asleep, most
+        asleep += 1
+        most = max(most, asleep)
+        await pause(seconds)
+        asleep -= 1
+
+    async def night() -> list[str]:
+        dormitory, woken = Dormitory(0.01), list[str]()
+
+        async def lie(bed: int, number: int) -> None:
             await dormitory.run(bed, Job(PLAN.key, number, number + 1))
             woken.append(f"{bed}-{number}")
 
-        begun = asyncio.get_running_loop().time()
-        await asyncio.gather(*(sleep(bed, number) for number in range(2) for bed in range(20)))
-        return asyncio.get_running_loop().time() - begun, woken
+        await asyncio.gather(*(lie(bed, number) for number in range(2) for bed in range(20)))
+        return woken
 
-    seconds, woken = asyncio.run(night())
-    assert 0.1 <= seconds < 1.0
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    woken = asyncio.run(night())
+    assert most == 20
     assert all(woken.index(f"{bed}-0") < woken.index(f"{bed}-1") for bed in range(20))
 
 

@@ -64,11 +64,11 @@ def sessions(scratch: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def look_around() -> None:
-    """Print what two private sessions, one after the other, look like from within."""
+    """Print what a private session looks like from within, and what it leaves."""
     before = dict(os.environ)
-    found = [look_at_session(), look_at_session()]
+    found = look_at_session()
     changed = sorted(name for name in before if os.environ.get(name) != before[name])
-    print(json.dumps({"sessions": found, "changed": changed, "left": len(session_files())}))
+    print(json.dumps({**found, "changed": changed, "left": len(session_files())}))
 
 
 def session_files() -> list[Path]:
@@ -136,17 +136,29 @@ def test_a_private_session_is_private_whatever_the_environment_says(scratch: Pat
     found = json.loads(done.stdout)
     assert found["changed"] == []
     assert found["left"] == 0
-    first, second = found["sessions"]
-    assert first["token"] != second["token"]
-    for each in (first, second):
-        assert len(each["token"]) == 64
-        assert each["told"] == {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": each["token"], "RAY_CLIENT_MODE": "0"}
-        assert each["written"] == [], "nobody needs the token but processes that are given it"
-        assert not each["argument"]
-        assert each["logs"] and each["servers"], "that was a session"
-        assert each["modes"] == ["0o700", "0o700"]
-        assert each["loopback_alone"]
-        assert each["stranger"].startswith("1  ") and "AuthenticationError" in each["stranger"]
+    assert len(found["token"]) == 64
+    assert found["told"] == {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": found["token"], "RAY_CLIENT_MODE": "0"}
+    assert found["written"] == [], "nobody needs the token but processes that are given it"
+    assert not found["argument"]
+    assert found["logs"] and found["servers"], "that was a session"
+    assert found["modes"] == ["0o700", "0o700"]
+    assert found["loopback_alone"]
+    assert found["stranger"].startswith("1  ") and "AuthenticationError" in found["stranger"]
+
+
+def test_every_session_has_a_token_of_its_own(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tokens: list[str] = []
+
+    def note(**settings: object) -> None:
+        tokens.append(os.environ["RAY_AUTH_TOKEN"])
+        raise RuntimeError("enough")
+
+    monkeypatch.setattr("ray.init", note)
+    for _ in range(2):
+        with pytest.raises(WorkerError), ray_session(1):
+            pass
+    assert [len(token) for token in tokens] == [64, 64]
+    assert tokens[0] != tokens[1]
 
 
 def test_benchmarks_import_ray_without_foreign_settings(

@@ -14,7 +14,7 @@ from shared.plan import Job, Plan, Setting
 from shared.store import Store
 from shared.tasks import task_named
 
-ROLLOUTS = 6
+ROLLOUTS = 4
 FLAGS = {
     "task": "pull",
     "seed": 11,
@@ -83,7 +83,7 @@ def test_the_order_and_the_size_of_jobs_do_not_matter(fresh: Store, objects: Pat
 def test_what_a_process_did_before_does_not_matter(
     fresh: Store, objects: Path, other_objects: Path, tmp_path: Path
 ) -> None:
-    grow_old(tmp_path / "others", fresh.setting, other_objects, 8)
+    grow_old(tmp_path / "others", fresh.setting, other_objects, 4)
     assert digest_of(tmp_path / "store", fresh.setting, objects, [(0, ROLLOUTS)]) == fresh.digest()
 
 

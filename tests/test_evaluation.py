@@ -90,7 +90,7 @@ def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(METHODS.names()))
-def test_a_method_needs_the_networks_that_its_proposers_check(name: str) -> None:
+def test_a_method_needs_the_networks_that_its_proposers_check_and_no_other(name: str) -> None:
     """Asked too little, a worker would meet the missing network in the middle of a collection."""
     from shared.adaptation import Adapter
     from shared.policy import Policy
@@ -98,13 +98,20 @@ def test_a_method_needs_the_networks_that_its_proposers_check(name: str) -> None
     from tests.finished_run import SMALL_NETWORK
 
     method = METHODS.get(name)
-    policy = Policy.untrained("push", SMALL_NETWORK, 0)
-    for module in method.modules:
-        if module in ("where2act-interaction", "where2act-adaptation"):
-            policy.begin_baseline(module, 0)
-        policy.with_trained(module)
-    for proposer in {method.critic, method.tries} - {None, "random"}:
-        proposer_named(str(proposer), Adapter(policy), np.random.default_rng(0), 1)
+
+    def make_proposers(trained: list[str]) -> None:
+        policy = Policy.untrained("push", SMALL_NETWORK, 0)
+        for module in trained:
+            if module in ("where2act-interaction", "where2act-adaptation"):
+                policy.begin_baseline(module, 0)
+            policy.with_trained(module)
+        for proposer in {method.critic, method.tries} - {None, "random"}:
+            proposer_named(str(proposer), Adapter(policy), np.random.default_rng(0), 1)
+
+    make_proposers([*method.modules])
+    for missing in method.modules:
+        with pytest.raises(UsageError, match=rf"{missing} is not trained"):
+            make_proposers([module for module in method.modules if module != missing])
 
 
 @pytest.fixture(scope="module")

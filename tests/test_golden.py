@@ -1,7 +1,7 @@
 """What every network computes of given weights and inputs, kept as numbers: a change of them is seen, and meant.
 
-Weights and inputs follow a formula, so that no random generator has a say. `python -m tests.test_golden` writes the
-numbers anew, for whoever means to change what a network computes.
+Weights and inputs follow a formula, so that no random generator has a say. Whoever means to change what a network
+computes writes the numbers anew: `python -m tests.test_golden`.
 """
 
 import json

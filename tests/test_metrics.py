@@ -1,48 +1,37 @@
 """Metrics count what receipts say, under labels that are few whatever is collected."""
 
 from collections import Counter as Tally
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
+from ray.util.metrics import Gauge, Metric
 
 from cluster import metrics
 from cluster.metrics import FleetMetrics
 from collector.receipt import Receipt
 from shared.plan import Plan
+from shared.vocabulary import OutcomeKind
 from tests.fabricate import fabricate_setting
 
 LABELS = {"task", "proposer", "outcome", "stage", "cause"}
 PLAN = Plan(setting=fabricate_setting(), proposer="aip", policy_version=3)
 
 
-class Recorded:
-    """What was counted, of all metrics."""
-
-    values: ClassVar[Tally[tuple[str, ...]]] = Tally()
-
-    def __init__(self, name: str, description: str, tag_keys: tuple[str, ...] = ()) -> None:
-        assert name.startswith("adaafford_") and description.endswith(".")
-        assert set(tag_keys) <= LABELS
-        self.name, self.tag_keys = name, tag_keys
-
-    def inc(self, value: float, tags: dict[str, str]) -> None:
-        assert value > 0, "Ray refuses to increase a counter by nothing"
-        self.values[self._key(tags)] += value
-
-    def set(self, value: float, tags: dict[str, str] | None = None) -> None:
-        self.values[self._key(tags or {})] = value
-
-    def _key(self, tags: dict[str, str]) -> tuple[str, ...]:
-        assert tuple(tags) == self.tag_keys
-        return (self.name, *tags.values())
-
-
 @pytest.fixture
 def values(monkeypatch: pytest.MonkeyPatch) -> Tally[tuple[str, ...]]:
-    monkeypatch.setattr(Recorded, "values", Tally())
-    for kind in ("Counter", "Gauge"):
-        monkeypatch.setattr(metrics, kind, Recorded)
-    return Recorded.values
+    """What Ray's own metrics were given, by the metric's name and its labels, after Ray had checked both."""
+    found: Tally[tuple[str, ...]] = Tally()
+    record = Metric._record
+
+    def note(metric: Metric, value: float, tags: dict[str, str] | None = None) -> None:
+        record(metric, value, tags)
+        name, labels = metric.info["name"], tuple((tags or {}).values())
+        assert f"ray_{name}" in str(metrics.__doc__)
+        assert tuple(tags or {}) == metric.info["tag_keys"] and set(tags or {}) <= LABELS
+        found[name, *labels] = value + (0 if isinstance(metric, Gauge) else found[name, *labels])
+
+    monkeypatch.setattr(Metric, "_record", note)
+    return found
 
 
 def receipt(**over: Any) -> Receipt:
@@ -51,8 +40,8 @@ def receipt(**over: Any) -> Receipt:
         "rollouts": 4,
         "interactions": 32,
         "successes": 8,
-        "outcomes": {"ok": 30, "no_contact": 2},
-        "seconds": {"physics": 1.5, "total": 2.0, "write": 0.0},
+        "outcomes": {OutcomeKind.OK.value: 30, OutcomeKind.NO_CONTACT.value: 2},
+        "seconds": {"simulate": 1.5, "total": 2.0, "write": 0.0},
     }
     return Receipt(**given | over)
 
@@ -70,8 +59,8 @@ def test_receipts_add_up(values: Tally[tuple[str, ...]]) -> None:
         ("adaafford_quarantined", "push", "aip"): 1,
         ("adaafford_successes", "push", "aip"): 24,
         ("adaafford_interactions", "push", "aip", "ok"): 90,
-        ("adaafford_interactions", "push", "aip", "no_contact"): 6,
-        ("adaafford_worker_seconds", "push", "aip", "physics"): 6.0,
+        ("adaafford_interactions", "push", "aip", "no-contact"): 6,
+        ("adaafford_worker_seconds", "push", "aip", "simulate"): 6.0,
         ("adaafford_worker_seconds", "push", "aip", "total"): 8.0,
         ("adaafford_restarts", "loss"): 1,
     }

@@ -16,7 +16,7 @@ from cluster.ledger import Ledger
 from cluster.logs import JsonLines, Lines, configure
 from cluster.progress import RECENT_S, CollectionProgress
 from cluster.standing import standing_of
-from cluster.status import SILENT_S, DriverStatus, read_status, status_kept
+from cluster.status import SILENT_S, DriverStatus, State, read_status, status_kept
 from collector.receipt import Receipt
 from shared.errors import UsageError
 from shared.files import host_name, process_name
@@ -25,6 +25,7 @@ from shared.store import Store, verify
 from shared.store.provenance import note_machine
 from shared.underway import Crumb
 from tests.fabricate import fabricate_rollouts, fabricate_setting
+from tests.waiting import wait_until
 
 SETTING = fabricate_setting()
 PLAN = Plan(setting=SETTING)
@@ -124,9 +125,7 @@ def test_the_keeper_writes_while_it_works_says_when_it_waits_and_how_it_ended(tm
     keeper = status_kept(store.place, lambda state: status_of(state), lambda: waiting, said.append, beat_s=0.01)
 
     def wait_for(state: str) -> None:
-        deadline = time.monotonic() + 60
-        while (found := read_status(store.place)) is None or found.state != state:
-            assert time.monotonic() < deadline
+        wait_until(lambda: (found := read_status(store.place)) is not None and found.state == state)
 
     with pytest.raises(KeyboardInterrupt), keeper:
         wait_for("collecting")
@@ -138,10 +137,18 @@ def test_the_keeper_writes_while_it_works_says_when_it_waits_and_how_it_ended(tm
 
 
 def test_a_status_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
-    store = fill(str(tmp_path / "store"))
+    store, states = fill(str(tmp_path / "store")), list[str]()
     (store.path / "status").write_text("a file in the place of the folder")
-    with status_kept(store.place, lambda state: status_of(state), lambda: False, lambda line: None):
-        pass
+
+    def status(state: State) -> DriverStatus:
+        states.append(state)
+        return status_of(state)
+
+    with status_kept(store.place, status, lambda: False, lambda line: None, beat_s=0.01):
+        wait_until(lambda: len(states) > 1)
+    assert {*states[:-1]} == {"collecting"} and states[-1] == "done", "it was tried again, and once more in the end"
+    assert read_status(store.place) is None
+    assert (store.path / "status").read_text() == "a file in the place of the folder"
 
 
 def test_a_run_says_its_stages_and_its_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

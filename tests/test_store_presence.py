@@ -198,8 +198,8 @@ def test_a_machine_of_the_same_name_sweeps_nothing_that_may_be_alive(tmp_path: P
     assert store.sweep() == 2
 
 
-AS_USER = """
-import os, sys, tempfile, time
+AS_USERS = """
+import json, os, sys, tempfile, time
 from pathlib import Path
 import cluster.commands.upkeep, cluster.commands.status, cluster.status, cluster.standing
 from cluster.cli import run
@@ -208,20 +208,34 @@ from tests.test_store_presence import PLAN, make
 from shared.plan import Job
 from shared.underway import Crumb
 from tests.fabricate import fabricate_rollouts
-warm = make(str(Path(tempfile.mkdtemp(dir=sys.argv[5])) / "warm"))   # What is imported late is imported now.
-verify(warm); compact(warm, 9); repair(warm.where); run(["status", warm.where])
-where, user, group, start = sys.argv[1], *map(int, sys.argv[2:5])
-os.setgroups([]); os.setgid(group); os.setuid(user); os.umask(0o002)
-store = Store.create(where, PLAN.setting)
-with store.only_driver():
-    store.sweep()
-    for k in range(start, start + 2):
-        store.underway.leave(Crumb(shard_id="x", rollout=k, written=time.time()))
-        job = Job(PLAN.key, k, k + 1)
-        store.commit(PLAN, job, fabricate_rollouts(PLAN, job, 1), {})
-    store.place.replace("status/driver.json", b"{}")
-codes = [run(["store", "compact", where, "--rollouts", "4"]), run(["store", "repair", where]), run(["status", where])]
-assert verify(store) == [] and codes == [0, 0, 0], codes
+
+def act(where, scratch, user, group, start):
+    warm = make(str(Path(tempfile.mkdtemp(dir=scratch)) / "warm"))   # What is imported late is imported now.
+    verify(warm); compact(warm, 9); repair(warm.where); run(["status", warm.where])
+    os.setgroups([]); os.setgid(group); os.setuid(user); os.umask(0o002)
+    store = Store.create(where, PLAN.setting)
+    with store.only_driver():
+        store.sweep()
+        for k in range(start, start + 2):
+            store.underway.leave(Crumb(shard_id="x", rollout=k, written=time.time()))
+            job = Job(PLAN.key, k, k + 1)
+            store.commit(PLAN, job, fabricate_rollouts(PLAN, job, 1), {})
+        store.place.replace("status/driver.json", b"{}")
+    commands = (["store", "compact", where, "--rollouts", "4"], ["store", "repair", where], ["status", where])
+    codes = [run(command) for command in commands]
+    assert verify(store) == [] and codes == [0, 0, 0], codes
+
+where, scratch, acts = *sys.argv[1:3], json.loads(sys.argv[3])
+sys.stdout = sys.stderr
+ended = []
+for user, group, start in acts:
+    # A process of its own for each, forked before any library has started a thread.
+    child = os.fork()
+    if child == 0:
+        act(where, scratch, user, group, start)
+        os._exit(0)
+    ended.append(os.waitpid(child, 0)[1])
+print(json.dumps(ended), file=sys.__stdout__)
 """
 
 
@@ -243,17 +257,13 @@ def test_users_of_one_group_share_a_store(shared_folder: Path, tmp_path: Path) -
     common.chmod(0o2775)
     where = str(common / "store")
 
-    def act(user: int, start: int, group: int = group) -> "subprocess.CompletedProcess[str]":
-        command = [sys.executable, "-c", AS_USER, where, str(user), str(group), str(start), str(tmp_path)]
-        return subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1], timeout=300)
-
-    for turn in range(2):
-        for k, user in enumerate(users):
-            done = act(user, 4 * turn + 2 * k)
-            assert done.returncode == 0, done.stderr
-    digest = Store.open(where).digest()
-    assert digest == make(str(tmp_path / "whole"), 8).digest()
-    stranger = act(54329, 8, group=54328)
-    assert stranger.returncode != 0
-    assert "write permission" in stranger.stderr
-    assert Store.open(where).digest() == digest
+    acts = [(user, group, 4 * turn + 2 * k) for turn in range(2) for k, user in enumerate(users)]
+    acts.append((54329, 54328, 8))
+    command = [sys.executable, "-c", AS_USERS, where, str(tmp_path), json.dumps(acts)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1], timeout=100)
+    assert done.returncode == 0, done.stderr
+    *members, stranger = json.loads(done.stdout)
+    assert members == [0] * 4, done.stderr
+    assert stranger != 0
+    assert "write permission" in done.stderr
+    assert Store.open(where).digest() == make(str(tmp_path / "whole"), 8).digest()

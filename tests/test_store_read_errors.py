@@ -89,10 +89,9 @@ def faults_of(where: str, fault: Fault) -> AbstractContextManager[list[str]]:
     return bucket_faults(fault, BUCKET_READ_CALLS) if is_url(where) else disk_read_faults(fault, where)
 
 
-def disturb(name: str, where: str, fault: Fault, out: Path) -> tuple[int, bool]:
-    """A command on a store of its own, and a fault in its reading; returns how many steps it had, and if it failed."""
-    store = make(where)
-    digest, failed = store.digest(), False
+def disturb(name: str, where: str, digest: str, fault: Fault, out: Path) -> tuple[int, bool]:
+    """A command on a sound store, and a fault in its reading; returns how many steps it had, and if it failed."""
+    failed = False
     with faults_of(where, fault) as steps:
         try:
             COMMANDS[name](where, out)
@@ -118,10 +117,18 @@ def disturb(name: str, where: str, fault: Fault, out: Path) -> tuple[int, bool]:
 
 def disturb_all(name: str, places: Iterator[str], kinds: tuple[str, ...], out: Path, every: int) -> tuple[int, int]:
     """Faults in the reading of a command, at each n-th step; how many were injected, and how many ended the command."""
-    steps, _ = disturb(name, next(places), Fault("none", 0), out)
+    store = make(next(places))
+    digest = store.digest()
+
+    def place() -> str:
+        """The same again, since it must be as it was after each fault; only a compaction makes another of it."""
+        return make(next(places)).where if name == "compact" else store.where
+
+    steps, _ = disturb(name, store.where, digest, Fault("none", 0), out)
     assert steps > 5
     tried = range(1 + steps % every, steps + 1, every)
-    ended = [disturb(name, next(places), Fault(kinds[k % len(kinds)], step), out)[1] for k, step in enumerate(tried)]
+    faults = [Fault(kinds[k % len(kinds)], step) for k, step in enumerate(tried)]
+    ended = [disturb(name, place(), digest, fault, out)[1] for fault in faults]
     return len(ended), sum(ended)
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -60,10 +61,11 @@ def test_compaction_changes_shards_and_nothing_else(kind: str, tmp_path: Path, r
 def test_a_compaction_that_fails_at_a_step_loses_and_doubles_nothing(tmp_path: Path) -> None:
     whole = make(tmp_path / "whole", (0, 1), (1, 2))
     rows = rows_of(whole)
+    shutil.copytree(whole.path, tmp_path / "0")
     with disk_faults(Fault("EIO", 0)) as steps:
-        compact(make(tmp_path / "none", (0, 1), (1, 2)), 9)
-    for step in range(1, len(steps) + 1, 11):
-        store = make(tmp_path / str(step), (0, 1), (1, 2))
+        compact(Store.open(tmp_path / "0"), 9)
+    for step in range(1, len(steps) + 1, 19):
+        store = Store.open(shutil.copytree(whole.path, tmp_path / str(step)))
         with disk_faults(Fault("EIO", step)), contextlib.suppress(OSError, StoreError):
             compact(store, 9)
         assert verify(store) == []
