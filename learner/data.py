@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -20,11 +22,12 @@ from shared.configuration import DynamicsRanges
 from shared.errors import StoreError, UsageError
 from shared.files import read_named
 from shared.geometry import view_from_world
-from shared.grouping import Grouping, group_cloud
+from shared.grouping import group_cloud
 from shared.networks.actions import middle_of
 from shared.networks.configuration import NetworkConfig
 from shared.networks.pointnet2 import CloudBatch
-from shared.store.columns import hidden_names, interaction_columns
+from shared.store.columns import LIST, Column, hidden_names, interaction_columns
+from shared.store.layout import MAX_ROWS
 from shared.store.store import Store
 from shared.store.tables import column_values
 from shared.vocabulary import Float, Float32, Order, OutcomeKind
@@ -126,37 +129,32 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
     hidden = hidden_names(ranges.added)
     names = (*COLUMNS, *hidden.values(), "observation")
     table = store.interactions(names)
-    cells = {name: column_values(table, known[name]) for name in names}
-    keep = np.flatnonzero([OutcomeKind(kind).is_label for kind in cells["outcome"]])
-    if not len(keep):
+    labels = pa.array([kind.value for kind in OutcomeKind if kind.is_label], pa.string())
+    table = table.filter(pc.is_in(table.column("outcome"), value_set=labels))
+    if not len(table):
         raise StoreError(f"{store.where}: holds no interaction to learn from; collect some first")
-    cells = {name: _take(values, keep) for name, values in cells.items()}
-    shards = _take(table.column("shard").to_pylist(), keep)
-    seen = list(zip(shards, cells["observation"].tolist(), strict=True))
-    index = {name: number for number, name in enumerate(sorted(set(seen)))}
-    points, movable, views = _read_clouds(store, list(index))
-    cloud = np.array([index[name] for name in seen])
-    batch = CloudBatch.of(points, group_all(points, config))
-    masks = torch.from_numpy(np.stack(movable))
+    cells = {name: _cells(table, known[name]) for name in names}
+    shards, shard = _coded(table, "shard")
+    seen, cloud = np.unique(shard * MAX_ROWS + cells["observation"], return_inverse=True)
+    places = ((shards[number // MAX_ROWS], int(number % MAX_ROWS)) for number in seen)
+    points, movable, views = _read_clouds(store, places, len(seen))
+    batch = CloudBatch.of(points, (group_cloud(each, config) for each in points))
+    masks = torch.from_numpy(movable)
     middles = middle_of(batch.points, masks)
     dynamics = {name: cells[column] for name, column in hidden.items()}
     rows = _rows(cells, dynamics, ranges, cloud, batch.points, views, middles)
-    rollouts = _group(cells)
+    order, starts = _by_rollout(table, cells)
+    objects, of_object = _coded(table, "object_id")
     return Dataset(
         task=store.setting.task,
         clouds=batch,
         movable=masks,
         middles=middles,
         rows=rows,
-        rollouts=tuple(torch.from_numpy(found) for found in rollouts),
-        objects=tuple(str(cells["object_id"][found[0]]) for found in rollouts),
-        versions=tuple(int(cells["policy_version"][found].max()) for found in rollouts),
+        rollouts=torch.from_numpy(order).tensor_split(torch.from_numpy(starts[1:])),
+        objects=tuple(objects[number] for number in of_object[order[starts]]),
+        versions=tuple(np.maximum.reduceat(cells["policy_version"][order], starts).tolist()),
     )
-
-
-def group_all(points: Iterable[Float32], config: NetworkConfig) -> list[Grouping]:
-    """Neighbour indices of clouds."""
-    return [group_cloud(cloud, config) for cloud in points]
 
 
 def split(dataset: Dataset, train: Collection[str] | None, validation: Collection[str] | None) -> Split:
@@ -223,26 +221,46 @@ def read_object_list(path: Path | None) -> frozenset[str] | None:
     return names
 
 
-def _take(values: Any, keep: NDArray[np.int64]) -> Any:
-    return values[keep] if isinstance(values, np.ndarray) else [values[row] for row in keep]
+def _cells(table: Any, column: Column[Any]) -> Any:
+    """A column as an array; lists of any length as their numbers, their lengths, and where each begins."""
+    if not column.dtype:
+        names, codes = _coded(table, column.name)
+        return np.array(names)[codes]
+    if column.width != LIST:
+        return column_values(table, column)
+    lists = table.column(column.name).combine_chunks()
+    lengths = pc.list_value_length(lists).to_numpy().astype(np.int64)
+    return lists.flatten().to_numpy(), lengths, np.cumsum(lengths) - lengths
+
+
+def _coded(table: Any, name: str) -> tuple[list[str], NDArray[np.int64]]:
+    """The different texts of a column, in order, and the number of each row's."""
+    encoded = table.column(name).combine_chunks().dictionary_encode()
+    texts = encoded.dictionary.to_pylist()
+    order = sorted(range(len(texts)), key=texts.__getitem__)
+    ranks = np.empty(len(texts), np.int64)
+    ranks[order] = np.arange(len(texts))
+    return [texts[number] for number in order], ranks[encoded.indices.to_numpy()]
 
 
 def _read_clouds(
-    store: Store, names: list[tuple[str, int]]
-) -> tuple[list[Float32], list[NDArray[np.bool_]], NDArray[np.float64]]:
+    store: Store, names: Iterable[tuple[str, int]], count: int
+) -> tuple[Float32, NDArray[np.bool_], NDArray[np.float64]]:
     """Clouds by shard and index: points in the view frame, movable masks, and the turn from world to view [O, 3, 3]."""
-    points, movable, views = [], [], []
+    size = store.setting.collection.camera.points
+    # Filled one by one, since a list of so many arrays would be in memory beside what they are stacked into.
+    points = np.empty((count, size, 3), np.float32)
+    movable, views = np.empty((count, size), np.bool_), np.empty((count, 3, 3))
     shard, arrays = "", None
-    for name, index in names:
+    for number, (name, index) in enumerate(names):
         if arrays is None or name != shard:
             shard, arrays = name, store.read_observations(name)
-        if not 0 <= index < len(arrays):
+        if not 0 <= index < len(arrays) or arrays.points.shape[1] != size:
             raise StoreError(f"{store.where}: shard {name} has no observation {index}; it is damaged")
-        view = view_from_world(arrays.world_from_camera[index])
-        points.append((arrays.points[index] @ view.T.astype(np.float32)).astype(np.float32))
-        movable.append(arrays.movable[index])
-        views.append(view)
-    return points, movable, np.stack(views)
+        views[number] = view_from_world(arrays.world_from_camera[index])
+        points[number] = arrays.points[index] @ views[number].T.astype(np.float32)
+        movable[number] = arrays.movable[index]
+    return points, movable, views
 
 
 def _rows(
@@ -281,29 +299,28 @@ def _rows(
         motion=torch.from_numpy(cells["motion"].astype(np.float32)),
         success=torch.from_numpy(cells["success"].astype(np.float32)),
         step=torch.from_numpy(cells["step"].astype(np.int64)),
-        continued=torch.from_numpy(np.array(cells["order"]) == Order.CONTINUE.value),
+        continued=torch.from_numpy(cells["order"] == Order.CONTINUE.value),
         facts=torch.from_numpy(facts),
-        role=np.array(cells["role"]),
-        method=np.array(cells["method"]),
+        role=cells["role"],
+        method=cells["method"],
         budget=cells["budget"].astype(np.int64),
     )
 
 
 def _room(cells: dict[str, Any]) -> NDArray[np.float64]:
     """How far each row's target joint can go up and down from where it starts, [I, 2]."""
-    room = np.zeros((len(cells["step"]), 2))
-    for row, part in enumerate(cells["target_part"].tolist()):
-        positions, limits = cells["joint_positions"][row], cells["joint_limits"][row].reshape(-1, 2)
-        if 1 <= part <= min(len(positions), len(limits)):
-            low, high = limits[part - 1]
-            room[row] = high - positions[part - 1], positions[part - 1] - low
+    (positions, joints, first), (limits, bounds, first_limit) = cells["joint_positions"], cells["joint_limits"]
+    part = cells["target_part"].astype(np.int64)
+    room = np.zeros((len(part), 2))
+    row = np.flatnonzero((part >= 1) & (part <= np.minimum(joints, bounds // 2)))
+    position, low = positions[(first + part - 1)[row]], (first_limit + 2 * part - 2)[row]
+    room[row, 0], room[row, 1] = limits[low + 1] - position, position - limits[low]
     return room
 
 
-def _group(cells: dict[str, Any]) -> list[NDArray[np.int64]]:
-    """Rows of each rollout, in order of step; rollouts in order of plan and number."""
-    groups: dict[tuple[str, int], list[int]] = {}
-    for row, key in enumerate(zip(cells["plan_key"], cells["rollout"].tolist(), strict=True)):
-        groups.setdefault(key, []).append(row)
-    steps = cells["step"]
-    return [np.array(sorted(groups[key], key=lambda row: steps[row])) for key in sorted(groups)]
+def _by_rollout(table: Any, cells: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The rows in order of plan, rollout and step, [I], and where in this order each rollout begins."""
+    plan, rollout = _coded(table, "plan_key")[1], cells["rollout"]
+    order = np.lexsort((cells["step"], rollout, plan))
+    is_first = (np.diff(plan[order], prepend=-1) != 0) | (np.diff(rollout[order], prepend=-1) != 0)
+    return order, np.flatnonzero(is_first)

@@ -1,5 +1,6 @@
 """Stores, runs, policies and histories of earlier versions open, and what newer software wrote is kept."""
 
+import dataclasses
 import hashlib
 import json
 import logging
@@ -16,13 +17,15 @@ import pytest
 from cluster.cli import run
 from shared.errors import SchemaVersionError, StoreError, UsageError
 from shared.plan import Job, Plan
+from shared.records import RolloutStatus
 from shared.store import Store, compact, export, info, merge, migrate, migration, repair, verify
 from shared.store.columns import ROLLOUT_COLUMNS, Column
 from shared.store.export import splits_by_share
+from shared.store.layout import Quarantined
 from shared.store.provenance import changed_versions
 from shared.store.sealed import seal, unseal
 from shared.store.tables import read_table
-from tests.fabricate import fabricate_rollouts, fabricate_setting
+from tests.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting
 
 FIXTURE = Path(__file__).parent / "fixtures" / "a96b627.tar.xz"
 DIGESTS = {
@@ -87,6 +90,32 @@ def test_a_store_of_the_first_version_opens_and_is_what_it_was(old: Path, tmp_pa
     assert merge([store], tmp_path / "merged")[0].digest() == DIGESTS[name]
     compact(store, 64)
     assert store.digest() == DIGESTS[name]
+
+
+def test_copies_leave_out_what_older_software_said_of_machines(tmp_path: Path) -> None:
+    one, other = make(tmp_path / "one", 1), Store.create(tmp_path / "other", SETTING)
+    one.commit(PLAN, Job(PLAN.key, 1, 3), fabricate_rollouts(PLAN, Job(PLAN.key, 1, 3), 2), {})
+    # Rollout 2 is in both, so that part of this shard is written anew, and the others are copied.
+    job = Job(PLAN.key, 2, 5)
+    last = dataclasses.replace(fabricate_rollout(PLAN, 4, 0), status=RolloutStatus.QUARANTINED)
+    reason = Quarantined(rollout=4, reason="it failed", command="")
+    other.commit(PLAN, job, [*fabricate_rollouts(PLAN, Job(PLAN.key, 2, 4), 2), last], {}, [reason])
+    for shard in [*shards_of(one), *shards_of(other)]:
+        described = unseal((shard / "manifest.json").read_bytes(), "manifest")
+        for each in described["quarantined"]:
+            each["command"] = "adaafford store replay /home/somebody/store"
+        provenance = {"host": "lab-7", "physics_s": "6.1"}
+        edit(shard / "manifest.json", provenance=provenance, quarantined=described["quarantined"])
+    digest = merge([one, other], tmp_path / "merged")[0].digest()
+    merge([Store.open(tmp_path / "merged")], tmp_path / "again")
+    compact(one, 8)
+    assert [manifest.provenance.get("host") for manifest in one.manifests()] == [None]
+    for name in ("merged", "again"):
+        store = Store.open(tmp_path / name)
+        assert verify(store) == []
+        assert (store.digest(), len(store.rollouts())) == (digest, 5)
+        assert [m.provenance["physics_s"] for m in store.manifests()] == ["6.1"] * 3
+        assert not [path for path, data in contents(store.path).items() if b"lab-7" in data or b"somebody" in data]
 
 
 def test_a_store_of_the_first_version_is_collected_into_trained_from_and_exported(

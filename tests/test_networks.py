@@ -1,5 +1,8 @@
 """Laws of the networks: what they may and may not depend on."""
 
+import weakref
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from shared.grouping import group_cloud, nearest_points
+from shared.grouping import Grouping, group_cloud, nearest_points
 from shared.networks.aap import Aap
 from shared.networks.actions import MOMENT_SCALE, action_inputs, geodesic_distance, in_gripper, orthonormal_frames
 from shared.networks.configuration import NETWORKS, NetworkConfig
@@ -216,3 +219,19 @@ def test_affordance_does_not_bend_the_critics_features() -> None:
 def test_inconsistent_configurations_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         NetworkConfig.model_validate(TINY.model_dump() | change)
+
+
+def test_clouds_do_not_keep_the_indices_that_they_are_made_of() -> None:
+    kept: list[weakref.ref[np.ndarray]] = []
+
+    def groupings() -> Iterator[Grouping]:
+        for cloud in stacked:
+            grouping = group_cloud(cloud, TINY)
+            kept.append(weakref.ref(grouping.neighbours[0]))
+            yield grouping
+            # One is at hand, in here and where it is stacked; others would be in memory twice.
+            assert sum(each() is not None for each in kept) == 1
+
+    stacked = np.random.default_rng(0).uniform(size=(4, 32, 3)).astype(np.float32)
+    batch = CloudBatch.of(stacked, groupings())
+    assert torch.equal(batch.neighbours[0][3], torch.from_numpy(group_cloud(stacked[3], TINY).neighbours[0]))

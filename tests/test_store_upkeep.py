@@ -18,6 +18,7 @@ from shared.observation import pack_normals
 from shared.plan import Job, Plan
 from shared.store import Store, compact, export, merge, verify
 from shared.store.export import splits_by_share
+from shared.store.observations import ARRAYS
 from tests.fabricate import fabricate_rollouts, fabricate_setting, identical
 from tests.faults import Fault, disk_faults
 
@@ -152,6 +153,25 @@ def test_an_export_holds_the_rows_and_their_clouds(tmp_path: Path) -> None:
     assert store.digest() in card
     assert "| train | 2 | 4 | 4 | 8 |" in card
     assert "Licence" in card
+
+
+def test_an_export_writes_what_many_shards_hold_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = make(tmp_path / "store", *((k, k + 1) for k in range(10)))
+    splits = {"train": frozenset(ref.id for ref in SETTING.objects)}
+    export(store, tmp_path / "whole", splits)
+    monkeypatch.setitem(export.__globals__, "SHARDS_A_GROUP", 4)
+    monkeypatch.setitem(export.__globals__, "CLOUDS_A_CHUNK", 3)
+    export(store, tmp_path / "parts", splits)
+    files = [pq.ParquetFile(tmp_path / name / "train/interactions.parquet") for name in ("whole", "parts")]
+    # What is known of each group is in memory until the file is closed.
+    assert [file.num_row_groups for file in files] == [1, 3]
+    keys = ["rollout", "step", "observation", "point_index", "object_id"]
+    assert files[0].read(keys).equals(files[1].read(keys))
+    clouds = [tmp_path / name / "train/observations.zarr" for name in ("whole", "parts")]
+    whole, parts = (zarr.open_group(folder, mode="r") for folder in clouds)
+    for kind in ARRAYS:
+        assert whole[kind.name].shape[0] == 10
+        assert np.array_equal(whole[kind.name][...], parts[kind.name][...])
 
 
 def test_test_objects_are_drawn_within_each_category(tmp_path: Path) -> None:

@@ -4,10 +4,12 @@ Shapes: B clouds, N points, n centres of a level, m points of the next finer lev
 Q queried points.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -37,15 +39,18 @@ class CloudBatch:
     nearest: tuple[Tensor, ...]
 
     @classmethod
-    def of(cls, points: Sequence[Float32], groupings: Sequence[Grouping]) -> "CloudBatch":
-        """Stack clouds that have one size."""
-        levels = range(len(groupings[0].neighbours))
-        stacked = torch.stack([torch.from_numpy(cloud) for cloud in points])
-        return cls(
-            stacked,
-            tuple(torch.stack([torch.from_numpy(g.neighbours[level]) for g in groupings]) for level in levels),
-            tuple(torch.stack([torch.from_numpy(g.nearest[level]) for g in groupings]) for level in levels),
-        )
+    def of(cls, points: Float32 | Sequence[Float32], groupings: Iterable[Grouping]) -> "CloudBatch":
+        """Stack clouds that have one size, and their indices, which are taken one by one."""
+        stacked = np.asarray(points)
+        levels: list[NDArray[np.int16]] = []
+        for number, grouping in enumerate(groupings):
+            found = (*grouping.neighbours, *grouping.nearest)
+            if not levels:
+                levels = [np.empty((len(stacked), *indices.shape), np.int16) for indices in found]
+            for all_indices, indices in zip(levels, found, strict=True):
+                all_indices[number] = indices
+        tensors = tuple(torch.from_numpy(indices) for indices in levels)
+        return cls(torch.from_numpy(stacked), tensors[: len(tensors) // 2], tensors[len(tensors) // 2 :])
 
     def select(self, clouds: Tensor) -> "CloudBatch":
         """The clouds at the indices `clouds`, [any]."""

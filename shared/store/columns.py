@@ -91,15 +91,12 @@ class Column(Generic[Row]):
     @property
     def arrow_type(self) -> Any:
         """The pyarrow type."""
-        if not self.dtype:
-            return pa.string()
-        number = pa.from_numpy_dtype(np.dtype(self.dtype))
-        return pa.list_(pa.field("element", number, nullable=False), self.width) if self.width else number
+        return _arrow_type(self.dtype, self.width)
 
     @property
     def field(self) -> Any:
         """The pyarrow field, with the description in its metadata."""
-        return pa.field(self.name, self.arrow_type, nullable=False, metadata={"description": self.description})
+        return _field(self.name, self.arrow_type, self.description)
 
     def gather(self, rows: Sequence[Row]) -> "Cells":
         """The column's cells for some rows.
@@ -124,6 +121,20 @@ class Column(Generic[Row]):
         if numbers.size and numbers.shape != shape:
             raise ValueError(f"{self.name} has shape {numbers.shape[1:]}, needs {shape[1:]}")
         return Cells(numbers.ravel(), (), ())
+
+
+# Made once: a store has as many columns as shards times their width, and all are alike.
+@lru_cache(maxsize=1024)
+def _arrow_type(dtype: str, width: int) -> Any:
+    if not dtype:
+        return pa.string()
+    number = pa.from_numpy_dtype(np.dtype(dtype))
+    return pa.list_(pa.field("element", number, nullable=False), width) if width else number
+
+
+@lru_cache(maxsize=1024)
+def _field(name: str, arrow_type: Any, description: str) -> Any:
+    return pa.field(name, arrow_type, nullable=False, metadata={"description": description})
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,10 +243,6 @@ def _action_columns() -> tuple[Column[InteractionRow], ...]:
         ),
         Column("normal", "<f8", 3, "surface normal at p, world", lambda x: i(x).normal),
     )
-
-
-def _names_of(row: InteractionRow) -> str:
-    return json.dumps(list(row.interaction.joint_names))
 
 
 def _choice_columns() -> tuple[Column[InteractionRow], ...]:

@@ -27,12 +27,15 @@ from shared.seeds import generator
 from shared.store.columns import INTERACTION_COLUMNS, interaction_columns
 from shared.store.coverage import ROLLOUT_COLUMN
 from shared.store.datacard import SplitFigures, data_card
-from shared.store.layout import INTERACTIONS_FILE
+from shared.store.layout import INTERACTIONS_FILE, MAX_ROWS
 from shared.store.observations import ARRAYS, ObservationArrays
 from shared.store.store import Store
 from shared.store.tables import joined, schema_of, unknown_columns
 
 CLOUDS_A_CHUNK = 64
+SHARDS_A_GROUP = 256
+"""Shards whose rows are written together, or fewer with many rows. What is known of each group of rows, 40 KB, is in
+memory until the last one is written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,13 +152,15 @@ class _SplitWriter:
                 compressors=BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"),
                 attributes={"description": kind.description},
             )
-        self._written = 0
+        self._tables: list[Any] = []
+        self._packed: dict[str, list[NDArray[Any]]] = {kind.name: [] for kind in ARRAYS}
+        self._written = self._waiting = 0
         self._figures = SplitFigures.nothing()
 
     def add(self, rollouts: Any, rows: Any, clouds: ObservationArrays) -> None:
         """Take what belongs to the split of a shard's two tables and its clouds."""
         rollouts, rows = (t.filter(pc.is_in(t.column("object_id"), value_set=self._objects)) for t in (rollouts, rows))
-        numbers = list(_observations_of(rollouts))
+        numbers = np.fromiter(_observations_of(rollouts), np.int64)
         places = np.full(len(clouds), -1, np.int32)
         places[numbers] = self._written + np.arange(len(numbers), dtype=np.int32)
         column = rows.schema.get_field_index("observation")
@@ -164,8 +169,14 @@ class _SplitWriter:
         for field in self._schema:
             if field.name not in rows.column_names:
                 rows = rows.append_column(field, pa.nulls(len(rows), field.type))
-        self._rows.write_table(rows.select(self._schema.names).cast(self._schema))
-        self._append(clouds, np.array(numbers, np.int64))
+        self._tables.append(rows.select(self._schema.names).cast(self._schema))
+        if len(self._tables) == SHARDS_A_GROUP or sum(map(len, self._tables)) >= MAX_ROWS:
+            self._write_rows()
+        for kind in ARRAYS:
+            self._packed[kind.name].append(kind.pack(getattr(clouds, kind.name)[numbers]))
+        self._waiting += len(numbers)
+        if self._waiting >= CLOUDS_A_CHUNK:
+            self._write_clouds(self._waiting - self._waiting % CLOUDS_A_CHUNK)
         self._written += len(numbers)
         self._figures = self._figures.with_rows(rollouts, rows, len(numbers))
 
@@ -175,16 +186,25 @@ class _SplitWriter:
         Raises:
             StoreError: there is not one row.
         """
+        self._write_rows()
         self._rows.close()
+        self._write_clouds(self._waiting)
         if not self._figures.interactions:
             raise StoreError(f"split '{self._name}' has no interaction; list other objects, or collect more")
         return self._figures
 
-    def _append(self, clouds: ObservationArrays, numbers: NDArray[np.int64]) -> None:
-        for kind in ARRAYS:
+    def _write_rows(self) -> None:
+        self._rows.write_table(pa.concat_tables([self._schema.empty_table(), *self._tables]))
+        self._tables.clear()
+
+    def _write_clouds(self, count: int) -> None:
+        """Write the first `count` clouds that wait: whole chunks, unless it is the last time."""
+        for kind in ARRAYS if count else ():
             array: Any = self._clouds[kind.name]
-            if len(numbers):
-                array.append(kind.pack(getattr(clouds, kind.name)[numbers]))
+            waiting = np.concatenate(self._packed[kind.name])
+            array.append(waiting[:count])
+            self._packed[kind.name] = [waiting[count:]]
+        self._waiting -= count
 
 
 def _observations_of(rollouts: Any) -> Iterator[int]:

@@ -120,7 +120,11 @@ def _struct(data: bytes, place: int, stop: int, depth: int = 0) -> tuple[dict[in
 
 
 def _integer(data: bytes, place: int, stop: int) -> tuple[int, int]:
-    number, place = _varint(data, place, stop)
+    # Most integers of a header have one byte.
+    if place < stop and (number := data[place]) < 128:
+        place += 1
+    else:
+        number, place = _varint(data, place, stop)
     return (number >> 1) ^ -(number & 1), place
 
 

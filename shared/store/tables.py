@@ -84,18 +84,19 @@ def read_table(data: bytes, columns: Columns, rows: int, source: str, names: Seq
             raise
         line = plain(" ".join(str(error).split()), 100)
         raise StoreError(f"{source}: cannot be decoded ({line}); the file is damaged or foreign") from None
-    left = size_limit(rows)
+    left, there = size_limit(rows), set(table.column_names)
     fields, arrays = [], []
     for column in columns:
         if names is not None and column.name not in names:
             continue
         fields.append(column.field)
-        if column.name not in table.column_names:
+        if column.name not in there:
             arrays.append(pa.array([column.default] * rows, column.arrow_type))
             continue
         cells = table.column(column.name)
         left -= _check_cells(cells, column, left, source)
-        cells = cells.cast(column.arrow_type)
+        if cells.type != column.arrow_type:
+            cells = cells.cast(column.arrow_type)
         if cells.null_count:
             # Older software wrote this shard anew, from some that had the column and some that had not.
             filled = [column.default if cell is None else cell for cell in cells.to_pylist()]
@@ -203,23 +204,23 @@ def _check_columns(there: Any, columns: Columns, source: str) -> None:
 
 def _check_cells(cells: Any, column: Column[Any], most: int, source: str) -> int:
     """Hold the cells of a column to what it allows; returns the bytes of its texts."""
-    size = 0
-    for chunk in cells.chunks:
-        if column.dtype:
-            numbers = (chunk.flatten() if column.width else chunk).drop_null()
-            if column.finite and column.dtype[1] == "f" and not np.isfinite(numbers.to_numpy()).all():
+    if column.dtype:
+        for chunk in cells.chunks if column.finite and column.dtype[1] == "f" else ():
+            numbers = chunk.flatten() if column.width else chunk
+            if not np.isfinite((numbers.drop_null() if numbers.null_count else numbers).to_numpy()).all():
                 raise StoreError(f"{source}: column {column.name} holds a number that is not finite; it is foreign")
-            continue
+        return 0
+    allowed = None if column.allowed is None else set(column.allowed)
+    for chunk in cells.chunks:
         for word in chunk.dictionary.to_pylist():
-            if column.allowed is not None and word not in list(column.allowed):
+            if allowed is not None and word not in allowed:
                 raise StoreError(
                     f"{source}: column {column.name} holds '{plain(word, MAX_WORD)}'; it is damaged or foreign"
                 )
             if len(word) > column.longest or not word.isprintable():
                 what = f"a text of {len(word)} characters, '{plain(word, 40)}'"
                 raise StoreError(f"{source}: column {column.name} holds {what}; it is damaged or foreign")
-    if not column.dtype:
-        size = _size_of_texts(cells)
+    size = _size_of_texts(cells)
     if size > most:
         raise StoreError(f"{source}: column {column.name} unpacks to {size} bytes; the file is damaged or foreign")
     return size

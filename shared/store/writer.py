@@ -8,6 +8,7 @@ from typing import Any
 from shared.errors import StoreError
 from shared.plan import Job
 from shared.records import RolloutRecord
+from shared.redaction import without_places
 from shared.reproduction import OBJECTS, STORE, reproduction
 from shared.store import observations
 from shared.store.columns import InteractionRow, RolloutRow, interaction_columns, rollout_columns
@@ -92,12 +93,8 @@ def commit_shard(
         files=_entries(files),
         digests=tuple(map(rollout_digest, rollouts, clouds)),
         software=store_software(),
-        # No host's name and no path goes into a manifest, also where older software wrote what is written again.
-        provenance=process_provenance() | {n: str(value) for n, value in provenance.items() if n != "host"},
-        quarantined=tuple(
-            each.model_copy(update={"command": reproduction(STORE, job.shard_id, OBJECTS, each.rollout)})
-            for each in quarantined
-        ),
+        provenance=process_provenance() | {name: str(value) for name, value in provenance.items()},
+        quarantined=tuple(quarantined),
     )
     described = manifest.as_document() | dict(unknown.fields)
     _publish(place, parse_manifest(seal(described), str(shard)), files, vetted=vetted)
@@ -105,7 +102,7 @@ def commit_shard(
 
 
 def copy_shard(source: Folder, manifest: ShardManifest, place: Place) -> None:
-    """Commit a shard of another place as it is, to the last byte, also what this software does not know of it.
+    """Commit a shard of another place: its files to the last byte, and its manifest, also what is unknown of it.
 
     Args:
         source: the shard.
@@ -138,6 +135,7 @@ def _check_digests(shard: Folder, manifest: ShardManifest) -> None:
 
 
 def _publish(place: Place, manifest: ShardManifest, files: Mapping[str, bytes], *, vetted: bool) -> None:
+    manifest = _without_places(manifest)
     shard = shard_folder(place, manifest.shard_id)
 
     def admit() -> None:
@@ -152,6 +150,21 @@ def _publish(place: Place, manifest: ShardManifest, files: Mapping[str, bytes], 
         return seal(described.as_document())
 
     place.publish(Publication(shard.key, files, MANIFEST_FILE, describe, admit, lock=manifest.plan_key))
+
+
+def _without_places(manifest: ShardManifest) -> ShardManifest:
+    """The manifest without a host's name and paths, which older software wrote into those that are copied here."""
+    provenance = {name: value for name, value in manifest.provenance.items() if name != "host"}
+    quarantined = tuple(
+        each.model_copy(
+            update={
+                "reason": without_places(each.reason),
+                "command": reproduction(STORE, manifest.shard_id, OBJECTS, each.rollout),
+            }
+        )
+        for each in manifest.quarantined
+    )
+    return manifest.model_copy(update={"provenance": provenance, "quarantined": quarantined})
 
 
 def _encode(
