@@ -24,7 +24,7 @@ from shared.policy import POLICY_FILE, WEIGHTS_FILE
 from tests.chaos.counts import Counts
 from tests.chaos.killer import Campaign, Killer
 from tests.chaos.processes import Marked, Role
-from tests.test_learner_training import FAST
+from tests.support.small_trainings import FAST
 
 SERIAL_DISK, SERIAL_BUCKET = "collect, one process, disk", "collect, one process, bucket"
 SESSION_DISK, SESSION_BUCKET = "collect, own Ray session, disk", "collect, own Ray session, bucket"

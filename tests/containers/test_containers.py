@@ -19,7 +19,7 @@ import pytest
 from cluster.training import as_toml
 from learner.configuration import AlternationConfig
 from tests.containers.engine import Engine, Services, engine, wait_for, why_not
-from tests.test_learner_training import FAST
+from tests.support.small_trainings import FAST
 
 ROOT = Path(__file__).parents[2]
 STORE = "s3://adaafford/store"
