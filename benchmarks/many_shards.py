@@ -23,7 +23,7 @@ from shared.networks.configuration import NetworkConfig
 from shared.plan import missing_ranges
 from shared.store import Store, compact, export, info, merge, repair, verify
 from shared.store.export import splits_by_share
-from tests.fabricate import fabricate_store
+from tests.support.fabricate import fabricate_store
 
 Progress = Callable[[int, int], None]
 

@@ -20,11 +20,11 @@ import numpy as np
 from cluster.configuration import CampaignConfig
 from learner.configuration import AlternationConfig
 from shared.policy import POLICY_FILE, WEIGHTS_FILE
-from tests.as_toml import as_toml
 from tests.chaos.counts import Counts
 from tests.chaos.killer import Campaign, Killer
 from tests.chaos.processes import Marked, Role
-from tests.test_learner_training import FAST
+from tests.support.as_toml import as_toml
+from tests.support.small_trainings import FAST
 
 SERIAL_DISK, SERIAL_BUCKET = "collect, one process, disk", "collect, one process, bucket"
 SESSION_DISK, SESSION_BUCKET = "collect, own Ray session, disk", "collect, own Ray session, bucket"

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from tests.chaos.counts import Counts
-from tests.faults import BUCKET_FAULTS, DISK_FAULTS, KILLS, bucket_faults, disk_faults
-from tests.test_store_crashes import run
-from tests.test_store_faults import digest_without_faults, disturb_all, kill_at_all
+from tests.store.test_crashes import run
+from tests.store.test_write_faults import digest_without_faults, disturb_all, kill_at_all
+from tests.support.faults import BUCKET_FAULTS, DISK_FAULTS, KILLS, bucket_faults, disk_faults
 
 pytestmark = pytest.mark.chaos
 

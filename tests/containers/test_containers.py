@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 
 from learner.configuration import AlternationConfig
-from tests.as_toml import as_toml
 from tests.containers.engine import Engine, Services, engine, wait_for, why_not
-from tests.test_learner_training import FAST
+from tests.support.as_toml import as_toml
+from tests.support.small_trainings import FAST
 
 ROOT = Path(__file__).parents[2]
 STORE = "s3://adaafford/store"

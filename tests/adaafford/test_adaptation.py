@@ -1,0 +1,157 @@
+"""The test-time procedure: proposals are rotations on movable points, and the history is a set."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from shared.adaptation import (
+    Adapter,
+    action_from_frame,
+    frames_in_view,
+    movable_points,
+)
+from shared.errors import UsageError
+from shared.networks.configuration import NetworkConfig
+from shared.policy import Policy
+from shared.proposers import AipProposer, ExploitProposer
+from shared.vocabulary import Action, Interaction, Proposer
+from tests.support.small_networks import TINY
+from tests.support.small_policies import history_of, observation_of, policy_of
+
+
+@pytest.fixture(scope="module")
+def adapter() -> Adapter:
+    return Adapter(policy_of())
+
+
+def proposers(adapter: Adapter, seed: int) -> list[Proposer]:
+    return [
+        AipProposer(adapter, np.random.default_rng(seed), budget=4, threshold=-1.0),
+        ExploitProposer(adapter, np.random.default_rng(seed)),
+        ExploitProposer(adapter, np.random.default_rng(seed), "where2act"),
+    ]
+
+
+@pytest.mark.parametrize("which", range(3))
+@pytest.mark.parametrize("tries", [0, 3])
+def test_a_proposal_is_a_rotation_at_a_movable_point(adapter: Adapter, which: int, tries: int) -> None:
+    observation = observation_of()
+    history = history_of(observation, tries)
+    action = proposers(adapter, 1)[which].propose(observation, history)
+    assert action is not None
+    assert observation.movable[action.point_index]
+    assert np.array_equal(action.point, observation.points[action.point_index])
+    np.testing.assert_allclose(action.rotation.T @ action.rotation, np.eye(3), atol=1e-9)
+    assert np.linalg.det(action.rotation) == pytest.approx(1.0)
+    again = proposers(Adapter(adapter.policy), 1)[which].propose(observation, history)
+    assert again is not None
+    assert again.point_index == action.point_index
+    assert np.array_equal(again.rotation, action.rotation)
+
+
+def test_names_are_those_that_rows_hold(adapter: Adapter) -> None:
+    assert [proposer.name for proposer in proposers(adapter, 0)] == ["aip", "aap", "where2act"]
+
+
+def test_aip_stops_on_its_budget_and_below_its_threshold(adapter: Adapter) -> None:
+    observation = observation_of()
+    rng = np.random.default_rng(0)
+    history = history_of(observation, 2)
+    assert AipProposer(adapter, rng, budget=2, threshold=-1.0).propose(observation, history) is None
+    assert AipProposer(adapter, rng, budget=3, threshold=-1.0).propose(observation, history) is not None
+    assert AipProposer(adapter, rng, budget=3, threshold=1e6).propose(observation, history) is None
+    assert AipProposer(adapter, rng, budget=3, threshold=1e6).propose(observation, []) is not None
+    assert AipProposer(adapter, rng, budget=3, threshold=1e6, at_least=0).propose(observation, []) is None
+
+
+def test_aip_takes_the_point_that_promises_most(adapter: Adapter) -> None:
+    observation = observation_of()
+    action = AipProposer(adapter, np.random.default_rng(0), budget=1).propose(observation, [])
+    assert action is not None
+    candidates = movable_points(observation)
+    information = adapter.information(observation, candidates, adapter.z([]))
+    assert action.point_index == candidates[information.argmax()]
+
+
+def test_an_exploit_is_among_the_hundred_best_points(adapter: Adapter) -> None:
+    observation = observation_of(points=600)
+    scores = adapter.affordance(observation, [])
+    best = set(sorted(movable_points(observation), key=lambda point: -scores[point])[:100])
+    exploit = ExploitProposer(adapter, np.random.default_rng(2))
+    for _ in range(5):
+        action = exploit.propose(observation, [])
+        assert action is not None
+        assert action.point_index in best
+
+
+def test_without_a_movable_point_nothing_is_proposed(adapter: Adapter) -> None:
+    still = dataclasses.replace(observation_of(), movable=np.zeros(200, dtype=bool))
+    with pytest.raises(UsageError, match="no movable point"):
+        AipProposer(adapter, np.random.default_rng(0), budget=1).propose(still, [])
+
+
+def test_untrained_policies_are_refused() -> None:
+    with pytest.raises(UsageError, match="not trained"):
+        AipProposer(Adapter(Policy.untrained("push", TINY, 0)), np.random.default_rng(0), budget=1)
+
+
+def test_the_order_of_the_history_does_not_matter_and_the_history_does(adapter: Adapter) -> None:
+    observation = observation_of()
+    history = history_of(observation, 5)
+    adapted = adapter.affordance(observation, history)
+    np.testing.assert_allclose(adapted, adapter.affordance(observation, history[::-1]), atol=1e-5)
+    assert np.abs(adapted - adapter.affordance(observation, [])).max() > 1e-4
+    assert ((adapted >= 0) & (adapted <= 1)).all()
+
+
+def test_turning_object_and_camera_together_changes_nothing(adapter: Adapter) -> None:
+    observation = observation_of()
+    angle = 0.8
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    pose = observation.world_from_camera.copy()
+    pose[:3] = turn @ pose[:3]
+    points = (observation.points @ turn.T).astype(np.float32)
+    turned = dataclasses.replace(observation, points=points, world_from_camera=pose)
+    history = history_of(observation, 3)
+    turned_history = [
+        Interaction(
+            turned,
+            Action(i.action.point_index, turn @ i.action.point, turn @ i.action.rotation),
+            i.outcome,
+        )
+        for i in history
+    ]
+    np.testing.assert_allclose(
+        adapter.affordance(observation, history), adapter.affordance(turned, turned_history), atol=2e-3
+    )
+
+
+def test_view_frames_come_back_as_the_action(adapter: Adapter) -> None:
+    observation = observation_of(azimuth=140.0)
+    action = history_of(observation, 1)[0].action
+    back = action_from_frame(observation, action.point_index, frames_in_view(observation, [action])[0])
+    np.testing.assert_allclose(back.rotation, action.rotation, atol=1e-6)
+
+
+def test_scores_of_single_actions_are_those_of_proposals(adapter: Adapter) -> None:
+    observation = observation_of()
+    history = history_of(observation, 2)
+    proposals = adapter.proposals(observation, int(movable_points(observation)[0]), np.random.default_rng(0))
+    actions = [action_from_frame(observation, proposals.point, frame) for frame in proposals.frames[:5]]
+    expected = adapter.score_proposals(observation, proposals, adapter.z(history))[:5].numpy()
+    np.testing.assert_allclose(adapter.score(observation, actions, history), expected, atol=1e-4)
+    assert adapter.prior_score(observation, actions).shape == (5,)
+
+
+def test_a_cloud_is_encoded_once(adapter: Adapter) -> None:
+    observation = observation_of(9)
+    assert adapter.encode(observation) is adapter.encode(observation)
+    assert adapter.encode(observation) is not adapter.encode(observation_of(9))
+
+
+def test_networks_of_full_size_propose_where_something_moves() -> None:
+    adapter, observation = Adapter(policy_of(NetworkConfig())), observation_of(points=2048)
+    action = AipProposer(adapter, np.random.default_rng(0), budget=4).propose(observation, [])
+    assert action is not None
+    assert observation.movable[action.point_index]

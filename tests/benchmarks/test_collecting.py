@@ -1,0 +1,175 @@
+"""Benchmarks of collection: what they print can be relied on, and nothing is wrong with their arithmetic."""
+
+import json
+import subprocess
+import sys
+import tomllib
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.published import PublishedSettings, measure
+from benchmarks.script import run_script
+from cluster.benchmarks.dynamics import ALL, DynamicsTrial, by_category
+from cluster.benchmarks.fidelity import PairedTrial, compare, summarise
+from cluster.cli import run
+from cluster.commands.bench import keep
+from collector.catalogue import scan
+from collector.procedural import generate
+from shared.configuration import CameraConfig, CollectionConfig, Fidelity, Timing
+from shared.errors import UsageError
+from shared.formatting import finite
+from shared.plan import Plan, Setting
+from shared.vocabulary import Outcome, OutcomeKind
+
+HASTE = Timing(steps_per_second=120, leg_steps=60, hold_steps=30)
+COARSE = Fidelity(name="coarse", approach=HASTE, drag=HASTE)
+COARSE_FLAGS = [
+    f"--reference.{name.replace('_', '-')}={value}" for name, value in COARSE.model_dump().items() if type(value) is int
+]
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("objects")
+    generate(folder, {"StorageFurniture": 1, "Faucet": 1}, seed=5)
+    return folder
+
+
+def bench(capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, object]:
+    """The object that a benchmark prints as its last line."""
+    assert run(["bench", *args, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert isinstance(found, dict)
+    return found
+
+
+def pair(expected: bool, got: bool, motions: tuple[float, float] = (0.0, 0.0)) -> PairedTrial:
+    reference, candidate = Outcome(OutcomeKind.OK, motions[0], expected), Outcome(OutcomeKind.OK, motions[1], got)
+    return PairedTrial("object", reference, candidate, 0.2, 0.1)
+
+
+def test_a_fidelity_agrees_with_itself(objects: Path) -> None:
+    refs = tuple(entry.ref for entry in scan(objects).usable)
+    faucets = tuple(ref for ref in refs if ref.category == "Faucet")
+    camera = CameraConfig(image_size=128, points=256, candidates=1000)
+    for task, applies_to in (("push", refs), ("push-faucet", faucets)):
+        plan = Plan(setting=Setting(task=task, seed=3, objects=applies_to, collection=CollectionConfig(camera=camera)))
+        result = compare(plan, objects, COARSE, COARSE, 12, lambda: None)
+        assert result.trials == 12
+        assert result.label_agreement == result.kind_agreement == result.positive_f1 == 1.0
+        assert result.confusions == ()
+        assert not result.motion_error_median > 0
+
+
+def test_f1_and_agreement_count_what_they_say() -> None:
+    pairs = [pair(True, True, (0.5, 0.4)), pair(True, False, (0.02, 0.0)), pair(False, True), pair(False, False)]
+    result = summarise(pairs)
+    assert result.label_agreement == 0.5
+    assert result.positive_f1 == 0.5
+    assert result.positives == result.candidate_positives == 2
+    assert result.motion_error_median == pytest.approx(np.median([0.1, 0.02]))
+    assert dict(result.confusions) == {"ok success -> ok": 1, "ok -> ok success": 1}
+    assert summarise([pair(False, False)]).positive_f1 == 1.0
+    assert summarise([pair(True, False)]).positive_f1 == 0.0
+
+
+def test_only_pairs_that_ever_succeed_can_depend_on_the_draw() -> None:
+    tried = {0: (True, True), 1: (True, False), 2: (False, False), 3: (True,)}
+    trials = [
+        DynamicsTrial("Door" if number else "Box", (0, 0, number), OutcomeKind.OK, success)
+        for number, successes in tried.items()
+        for success in successes
+    ]
+    found = by_category(trials)
+    assert list(found) == ["Box", "Door", ALL]
+    assert (found[ALL].trials, found[ALL].pairs, found[ALL].ever, found[ALL].depends) == (7, 3, 2, 1)
+    assert found[ALL].base_rate == pytest.approx(4 / 7)
+    assert found["Door"].depends_share == 1.0
+    assert found["Box"].depends_share == 0.0
+    assert np.isnan(by_category(trials[-1:])[ALL].depends_share)
+
+
+def test_fidelity_prints_its_figures(capsys: pytest.CaptureFixture[str], objects: Path) -> None:
+    found = bench(capsys, "fidelity", "--objects", str(objects), "--trials", "3", *COARSE_FLAGS)
+    expected = "label_agreement positive_f1 trials positives motion_error_median reference_ms fast_ms"
+    assert set(expected.split()) <= found.keys()
+    assert found["trials"] == 3
+
+
+def test_dynamics_prints_its_figures(capsys: pytest.CaptureFixture[str], objects: Path) -> None:
+    flags = ["--rollouts", "2", "--draws", "2", "--actions", "2"]
+    found = bench(capsys, "dynamics", "--objects", str(objects), *flags)
+    assert {"base_rate", "outcomes", "depends_on_draw", "categories"} <= found.keys()
+    assert isinstance(found["categories"], dict)
+    assert set(found["categories"]) <= {"StorageFurniture", "Faucet"}
+
+
+def test_collect_times_what_users_run(capsys: pytest.CaptureFixture[str], objects: Path, tmp_path: Path) -> None:
+    flags = ["--rollouts", "1", "--repeats", "2", "--collection.rollout.interactions", "4"]
+    found = bench(capsys, "collect", "--objects", str(objects), *flags, "--out", str(tmp_path))
+    assert found["interactions"] == 4
+    rate = found["interactions_per_core_second"]
+    assert isinstance(rate, float)
+    assert rate > 0
+    stages = found["stage_seconds"]
+    assert isinstance(stages, dict)
+    assert stages.keys() == {"load", "settle", "observe", "propose", "simulate", "write", "other"}
+    kept = [json.loads(path.read_text()) for path in tmp_path.glob("*-collect-push-*.json")]
+    assert [document["result"] for document in kept] == [found]
+    assert {"date", "hardware", "software"} <= kept[0].keys()
+
+
+def test_the_published_protocol_executes_some_of_the_stored_trials(
+    capsys: pytest.CaptureFixture[str], objects: Path
+) -> None:
+    flags = ["--rollouts", "1", "--repeats", "1", "--sample", "2", "--collection.rollout.interactions", "4", "--json"]
+    assert run_script("published", PublishedSettings, measure, ["--objects", str(objects), *flags]) == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (found["interactions"], found["published_trials"]) == (4, 2)
+    assert found["times_published_protocol"] > found["times_published_protocol_with_short_settling"] > 0
+
+
+def test_no_shipped_package_finds_the_scripts() -> None:
+    settings = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    shipped = settings["tool"]["setuptools"]["packages"]["find"]["include"]
+    assert not any(fnmatch(name, pattern) for name in ("benchmarks", "examples") for pattern in shipped)
+
+
+@pytest.mark.parametrize(
+    ("args", "expected"),
+    [
+        (["fidelty"], "fidelity, dynamics, collect, learner; given 'fidelty'"),
+        ([], "given nothing"),
+        (["fidelity", "--task", "pusk"], "unknown task 'pusk'; allowed: push"),
+        (["fidelity", "--trials", "0"], "trials"),
+        (["dynamics", "--draws", "1"], "draws"),
+        (["collect", "--objects", "/nowhere/at/all"], "/nowhere/at/all: no such folder"),
+    ],
+)
+def test_bad_input_is_one_line(capsys: pytest.CaptureFixture[str], args: list[str], expected: str) -> None:
+    assert run(["bench", *args]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert expected in err
+    assert err.count("\n") == 1
+
+
+def test_what_is_not_a_number_becomes_null_and_an_unwritable_folder_is_named(tmp_path: Path) -> None:
+    assert finite({"a": float("nan"), "b": [1.5, float("inf")]}) == {"a": None, "b": [1.5, None]}
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="file"):
+        keep({}, tmp_path / "file", "name")
+
+
+@pytest.mark.slow
+def test_a_fleet_makes_what_one_worker_makes(objects: Path) -> None:
+    flags = ["--rollouts", "2", "--repeats", "1", "--collection.rollout.interactions", "2"]
+    script = "from cluster.cli import main; main()"  # In a process of its own: Ray wants to be imported before SAPIEN.
+    command = [sys.executable, "-c", script, "bench", "collect", "--objects", str(objects), *flags]
+    done = subprocess.run([*command, "--workers", "2", "--json"], capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["same_digest"] is True
+    assert found["workers_speedup"] > 0

@@ -1,0 +1,225 @@
+"""Evaluation by itself: intervals are honest, tables say what was found, and a stop changes nothing."""
+
+import csv
+import dataclasses
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cluster.blame import JobError
+from cluster.cli import run as adaafford
+from cluster.evaluation import PROPOSER, Evaluation
+from cluster.evaluation_of_run import evaluate_run
+from cluster.evaluation_settings import EvaluateSettings
+from cluster.evaluation_tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
+from cluster.judging import judge
+from cluster.session import Crew
+from collector.procedural.writing import generate
+from collector.worker import Worker
+from learner.bootstrap import ratio_interval
+from learner.evaluation import EvaluationRow, ObjectCounts
+from learner.metrics import f_score
+from shared.errors import UsageError
+from shared.formatting import csv_table
+from shared.methods import METHODS
+from shared.plan import EvaluationConfig, Plan, Setting
+from shared.store import Store
+from tests.support.finished_run import make_finished_run
+
+FAST = EvaluateSettings(methods=("where2act", "ours-random"), budgets=(1,), trials=2, queries=4, per_shard=1, workers=0)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(0, 5)), min_size=1, max_size=60))
+def test_an_interval_of_f_scores_lies_where_f_scores_lie(rows: list[tuple[bool, bool, int]]) -> None:
+    claimed, true = (np.array([row[k] for row in rows]) for k in (0, 1))
+    low, high = ratio_interval(2 * (claimed & true), 1 * claimed + true, [row[2] for row in rows])
+    whole = f_score(claimed, true)
+    assert np.isnan(low) == np.isnan(high) == np.isnan(whole)
+    if not np.isnan(whole):
+        assert 0 <= low <= high <= 1
+
+
+def test_objects_are_resampled_whole() -> None:
+    """Ten equal rows of an object are no more evidence than one."""
+    success = np.random.default_rng(1).random(30) < 0.4
+    one = ratio_interval(success, np.ones(30), np.arange(30))
+    ten = ratio_interval(np.repeat(success, 10), np.ones(300), np.repeat(np.arange(30), 10))
+    assert one == ten
+    rows = ratio_interval(np.repeat(success, 10), np.ones(300), np.arange(300))
+    assert rows[1] - rows[0] < 0.5 * (one[1] - one[0])
+
+
+def test_an_interval_covers_the_truth_about_as_often_as_it_says() -> None:
+    rng, truth, hits = np.random.default_rng(2), 0.3, 0
+    for _ in range(100):
+        rates = rng.beta(3, 7, size=40)
+        success = rng.random((40, 10)) < rates[:, None]
+        low, high = ratio_interval(success.ravel(), np.ones(400), np.repeat(np.arange(40), 10))
+        hits += low <= truth <= high
+    assert 85 <= hits <= 100
+
+
+def test_one_object_says_nothing_of_others() -> None:
+    low, high = ratio_interval([1, 0, 1], [1, 1, 1], [7, 7, 7])
+    assert low == high == pytest.approx(2 / 3)
+    assert np.isnan(ratio_interval([], [], [])).all()
+
+
+def table_of(**values: object) -> EvaluationTable:
+    row = {
+        **{"method": "ours-final", "budget": 2, "f_score": 0.5, "f_score_low": 0.25, "f_score_high": 0.75},
+        **{"sample_success": None, "sample_success_low": None, "sample_success_high": None, "trials": 0},
+        **{"start_success": 0.4, "start_success_low": 0.2, "start_success_high": 0.6, "counts": {"object": ["a"]}},
+        **{"best_f": 0.6, "bce": 0.5, "auc": None, "base_rate": 0.3, "mean_tries": 2.0, "gap_closed": None},
+    }
+    return EvaluationTable("push-faucet", 1, 4, 40, 2, "ab" * 32, {"a": "cd" * 32}, (row | values,))
+
+
+def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
+    shown = as_markdown(table_of())
+    assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | 40.0 [20.0, 60.0] | - | 0 |" in shown
+    assert "30.0% succeed" in shown
+    read = list(csv.DictReader(io.StringIO(csv_table(table_of().rows, ["counts"]))))
+    assert (read[0]["f_score"], read[0]["auc"]) == ("0.5", "")
+    assert "counts" not in read[0]
+
+
+@pytest.mark.parametrize("name", sorted(METHODS.names()))
+def test_a_method_needs_the_networks_that_its_proposers_check_and_no_other(name: str) -> None:
+    """Asked too little, a worker would meet the missing network in the middle of a collection."""
+    from shared.adaptation import Adapter
+    from shared.policy import Policy
+    from shared.proposers import proposer_named
+    from tests.support.finished_run import SMALL_NETWORK
+
+    method = METHODS.get(name)
+
+    def make_proposers(trained: list[str]) -> None:
+        policy = Policy.untrained("push", SMALL_NETWORK, 0)
+        for module in trained:
+            if module in ("where2act-interaction", "where2act-adaptation"):
+                policy.begin_baseline(module, 0)
+            policy.with_trained(module)
+        for proposer in {method.critic, method.tries} - {None, "random"}:
+            proposer_named(str(proposer), Adapter(policy), np.random.default_rng(0), 1)
+
+    make_proposers([*method.modules])
+    for missing in method.modules:
+        with pytest.raises(UsageError, match=rf"{missing} is not trained"):
+            make_proposers([module for module in method.modules if module != missing])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_finished_run(tmp_path_factory.mktemp("evaluation") / "run").path
+
+
+def test_missing_networks_are_refused_before_anything_is_tried(finished: Path, tmp_path: Path) -> None:
+    settings = FAST.model_copy(update={"methods": ("ours-final", "where2act-adaptation")})
+    with pytest.raises(UsageError, match="where2act-adaptation is not trained"):
+        evaluate_run(finished, settings, tmp_path / "out")
+    assert Store.open(tmp_path / "out" / "store").committed() == []
+
+
+def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) -> None:
+    store = Store.open(finished / "store")
+    told = {**dict(store.setting), "kind": "evaluation", "evaluation": EvaluationConfig(methods=("where2act",))}
+    evaluation = Store.create(tmp_path / "store", Setting(**told))
+    evaluation.add_plan(Plan(setting=evaluation.setting, proposer=PROPOSER, policy_version=7))
+    wanted = Evaluation(evaluation, store, 1, 2, 1, finished / "objects", tmp_path, tmp_path)
+    with pytest.raises(UsageError, match="trials of another policy"):
+        wanted.execute(Crew(lambda *_: pytest.fail("a fleet was asked for")), print)
+
+
+def row_of(method: str, budget: int, f_score: float) -> EvaluationRow:
+    figures = dict.fromkeys((field.name for field in dataclasses.fields(EvaluationRow)), 0.5)
+    told = {"method": method, "budget": budget, "f_score": f_score, "counts": ObjectCounts(*[()] * 9)}
+    return EvaluationRow(**figures | told)
+
+
+def test_where2act_stands_at_every_budget_and_the_oracle_closes_the_gap(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store.open(finished / "store")
+    told = {**dict(store.setting), "kind": "evaluation", "evaluation": EvaluationConfig(budgets=(1, 4))}
+    evaluation = Store.create(tmp_path / "store", Setting(**told))
+    evaluation.publish_policy(1, store.read_policy(1))
+    rows = [row_of("where2act", 0, 0.2), row_of("oracle", 0, 0.7), row_of("ours-final", 4, 0.6)]
+    no_gap = [*rows[::2], row_of("oracle", 0, 0.1)]
+    for known, closed in ((rows, {0.0, 1.0, 0.8}), (rows[::2], {None}), (no_gap, {None})):
+        monkeypatch.setattr("cluster.judging.evaluate_store", lambda *_, known=known: known)
+        table = judge(evaluation, 1, tmp_path / "no-oracle")
+        assert [row["budget"] for row in table.rows if row["method"] == "where2act"] == [1, 4]
+        assert {row["gap_closed"] and round(row["gap_closed"], 9) for row in table.rows} == closed
+
+
+def test_what_does_not_suit_is_refused_in_one_line(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    generate(tmp_path / "boxes", {"Box": 1}, seed=1)
+    for arguments, expected in (
+        (["--run", str(tmp_path / "gone")], "holds no run"),
+        (["--run", str(finished), "--policy", "7"], "there is no policy 7; published: 1"),
+        (["--run", str(finished), "--task", "pull"], "the run is trained to push"),
+        (["--run", str(finished), "--budgets", "0"], "budgets"),
+        (["--run", str(finished), "--task", "pusk"], "unknown task 'pusk'"),
+        (["--run", str(finished), "--objects", str(tmp_path / "boxes")], "suits the task 'push-faucet'"),
+    ):
+        assert adaafford(["evaluate", *arguments, "--workers", "0"]) == 2
+        line = capsys.readouterr().err
+        assert expected in line
+        assert line.count("\n") == 1
+    assert not (finished / "evaluations").exists()
+
+
+def test_what_was_trained_on_is_never_tested_on(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Given the folder that it was trained on, a run is tested on the rest of it."""
+    tested = []
+
+    def pretend(evaluation: Evaluation, _: EvaluateSettings) -> None:
+        tested.append(evaluation.store.setting.objects)
+        (evaluation.out / MARKDOWN_FILE).write_text("")
+
+    monkeypatch.setattr("cluster.evaluation_of_run._execute", pretend)
+    used = json.loads((finished / "objects.json").read_bytes())
+    for objects in (None, finished / "objects"):
+        evaluate_run(finished, FAST.model_copy(update={"objects": objects}), tmp_path / f"out-{objects is None}")
+    assert [[ref.id for ref in refs] for refs in tested] == [[ref["id"] for ref in used["test"]]] * 2
+
+
+@pytest.mark.slow
+def test_a_stopped_evaluation_ends_in_the_same_table(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    evaluate_run(finished, FAST, whole)
+    execute, calls = Worker.execute, []
+
+    def dying(*args: object) -> object:
+        calls.append(args)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return execute(*args)
+
+    with monkeypatch.context() as patch, pytest.raises((KeyboardInterrupt, JobError)):
+        patch.setattr(Worker, "execute", dying)
+        evaluate_run(finished, FAST, stopped)
+    begun = Store.open(stopped / "store")
+    assert len(begun.committed()) == 1
+    # One trial of one object; the other has had none.
+    assert judge(begun, 1, tmp_path / "no-oracle").objects == 1
+    assert not (stopped / RESULTS_FILE).exists()
+    evaluate_run(finished, FAST, stopped)
+    for name in (RESULTS_FILE, CSV_FILE, MARKDOWN_FILE):
+        assert (stopped / name).read_bytes() == (whole / name).read_bytes()
+    found = json.loads((whole / RESULTS_FILE).read_bytes())
+    assert (found["rollouts"], found["objects"]) == (4, 2)
+    per_object = {row["method"]: row["trials"] for row in found["rows"]}
+    assert per_object == {"where2act": 4, "aap-no-tries": 0, "ours-random": 4}

@@ -1,0 +1,79 @@
+"""Furthest-point sampling: each sample is the furthest there is, and ties go as they always went."""
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from shared.furthest_points import furthest_points
+
+
+def assert_furthest(points: NDArray[np.float32], chosen: NDArray[np.int64]) -> None:
+    """Every sample after the first is, in single precision, as far from those before as any point is."""
+    squared = np.full(len(points), np.inf, dtype=np.float32)
+    for number, sample in enumerate(chosen):
+        assert number == 0 or squared[sample] == squared.max()
+        x, y, z = (points - points[sample]).T
+        squared = np.minimum(squared, x * x + y * y + z * z)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 400), st.floats(0.0, 1.0), st.booleans(), st.integers(0, 2**32 - 1))
+def test_furthest_points_of_any_cloud_are_each_the_furthest(size: int, share: float, grid: bool, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = (rng.integers(0, 3, (size, 3)) if grid else rng.normal(size=(size, 3))).astype(np.float32)
+    count = max(1, round(share * size))
+    chosen = furthest_points(points, count)
+    assert chosen.shape == (count,)
+    assert chosen.min() >= 0 and chosen.max() < size
+    assert_furthest(points, chosen)
+
+
+def test_furthest_points_of_a_cloud_are_all_of_it_once() -> None:
+    points = np.random.default_rng(1).normal(size=(257, 3)).astype(np.float32)
+    assert sorted(furthest_points(points, 257)) == list(range(257))
+
+
+# Digests of what fpsample 1.0.2 and 0.3.3 (`bucket_fps_kdline_sampling`, h=5) gave: stores were made with it.
+@pytest.mark.parametrize(
+    ("size", "count", "steps", "digest"),
+    [
+        (20_000, 2048, 0, "4b50daa42dfa3fdd"),
+        (20_000, 2048, 24, "bb88925ce819a05f"),
+        (64, 64, 3, "1a2423328eb3d1f9"),
+    ],
+)
+def test_furthest_points_that_are_equally_far_come_in_the_order_of_stored_data(
+    size: int, count: int, steps: int, digest: str
+) -> None:
+    points = np.random.default_rng(7).uniform(-1, 1, (size, 3))
+    if steps:  # Few places, so that many points are equally far.
+        points = np.round(points * steps) / steps
+    chosen = furthest_points(points.astype(np.float32), count)
+    assert hashlib.sha256(chosen.astype("<i8").tobytes()).hexdigest()[:16] == digest
+
+
+def test_compiled_code_is_kept_in_the_cache_of_the_user_and_nowhere_without_a_home(tmp_path: Path) -> None:
+    script = "import numpy; from shared.furthest_points import furthest_points as f; f(numpy.eye(3, dtype='f4'), 2)"
+    here, cache, temporary = tmp_path / "here", tmp_path / "cache", Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))
+    here.mkdir()
+    base = {name: value for name, value in os.environ.items() if name not in ("HOME", "XDG_CACHE_HOME")}
+    base |= {"PYTHONPATH": str(Path(__file__).parents[2]), "TMPDIR": str(temporary)}
+    for more in ({"XDG_CACHE_HOME": str(cache)}, {"HOME": "~"}):
+        done = subprocess.run(
+            [sys.executable, "-c", script], env=base | more, cwd=here, capture_output=True, text=True, check=False
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+    assert list(cache.rglob("*.nbi"))
+    assert list(temporary.rglob("*.nbi"))
+    assert list(here.iterdir()) == []
+    shutil.rmtree(temporary)

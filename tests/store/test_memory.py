@@ -1,0 +1,62 @@
+"""Memory of whoever goes through a store: it must not grow with the manifests, of which there may be a million."""
+
+import gc
+import tracemalloc
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from shared.store import Store, compact, export, info, merge, reader, verify
+from shared.store.export import splits_by_share
+from tests.support.fabricate import fabricate_store
+
+FEW, MANY, AT_ONCE = 4, 20, 4
+MOST_BYTES = 10_000
+"""Of a shard, whose manifest alone took 20 KB. Names and ranges are kept, some hundred bytes each; a small store also
+shows what caches and garbage take once."""
+
+
+def tidy(done: int, total: int) -> None:
+    """Collect what Zarr leaves in cycles, which Python does when it sees fit."""
+    gc.collect()
+
+
+COMMANDS: dict[str, Callable[[Store, Path], object]] = {
+    "jobs": lambda store, _: store.jobs(),
+    "digest": lambda store, _: store.digest(),
+    "info": lambda store, _: info(store),
+    "verify": lambda store, _: verify(store, tidy),
+    "merge": lambda store, out: merge([store], out, tidy),
+    "export": lambda store, out: export(store, out, splits_by_share(store, 0.0, 1), tidy),
+    "compact": lambda store, _: compact(store, 4, tidy),
+}
+
+
+@pytest.fixture
+def little_garbage() -> Iterator[None]:
+    """What other tests have imported is not looked through at every collection."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.usefixtures("little_garbage")
+@pytest.mark.parametrize("name", COMMANDS)
+def test_memory_hardly_grows_with_the_number_of_shards(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As many manifests are in memory at once as a bucket gives at once; fewer here, so that a small store shows it.
+    monkeypatch.setattr(reader, "_BATCH", AT_ONCE)
+    peaks = []
+    # The first store warms up whatever is kept for good; of the large ones, one may meet the moment at which Python
+    # makes its table of texts larger.
+    for k, shards in enumerate((FEW, FEW, MANY, MANY)):
+        store = fabricate_store(tmp_path / f"store-{k}", shards, rollouts=1)
+        tracemalloc.start()
+        COMMANDS[name](store, tmp_path / f"out-{k}")
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert (min(peaks[2:]) - peaks[1]) / (MANY - FEW) < MOST_BYTES
