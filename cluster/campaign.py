@@ -137,7 +137,8 @@ class Campaign:
         """Decide which objects are trained on and which are kept for the end, and make both stores."""
         run, config = self._run, self._config
         task = config.task_record
-        packages_used(task, config.collection)  # What cannot be found is refused before any object is read.
+        # What cannot be found is refused before any object is read.
+        packages_used(task, config.collection, config.evaluation)
         per_category = config.procedural.per_category
         built_in, lists = run.generated_objects.resolve(), lists_of(config.splits)
         catalogue, folder = objects_for(task, config, built_in, per_category, config.seed, lists)
