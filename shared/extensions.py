@@ -6,7 +6,9 @@ A package adds a primitive called "twist" by these lines of its pyproject.toml, 
     twist = "my_package.twist:TWIST"
 """
 
+import sys
 from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
@@ -76,7 +78,7 @@ class Registry(Generic[Item]):
             UsageError: two packages add one of the same name.
         """
         found: dict[str, EntryPoint] = {}
-        for entry in entry_points(group=self.group):
+        for entry in _entry_points(self.group, tuple(sys.path)):
             if entry.name in self._built_in:
                 raise UsageError(f"'{entry.value}' adds the {self.kind} '{entry.name}', which is built in; rename it")
             if entry.name in found and found[entry.name].value != entry.value:
@@ -94,6 +96,12 @@ class Registry(Generic[Item]):
         if not isinstance(item, self._of):
             raise UsageError(f"{self.kind} '{entry.name}': '{entry.value}' is no {self._of.__name__}")
         return item
+
+
+@lru_cache(maxsize=64)
+def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Those of a group, of what is installed along Python's path; looking through it takes 5 ms, so it is done once."""
+    return tuple(entry_points(group=group))
 
 
 def added_by_packages(used: Iterable[tuple[Registry[Any], str]]) -> tuple[str, ...]:
