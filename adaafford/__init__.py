@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from adaafford.heatmaps import write_heatmap
     from adaafford.pretrained import load_policy
     from adaafford.scans import ScanFrame, checked_scan, doubtful_up, observation_of, read_scan
-    from cluster.library import collect, simulated, train
-    from shared.adaptation import Adapter
+    from cluster.cli.library import collect, simulated, train
     from shared.errors import AdaAffordError
-    from shared.policy import Policy
-    from shared.proposers import AipProposer, ExploitProposer
+    from shared.policies.adaptation import Adapter
+    from shared.policies.policy import Policy
+    from shared.policies.proposers import AipProposer, ExploitProposer
     from shared.store import Store
-    from shared.vocabulary import (
+    from shared.types import (
         Action,
         Environment,
         Interaction,
@@ -48,13 +48,13 @@ else:
         "adaafford.heatmaps": ("write_heatmap",),
         "adaafford.pretrained": ("load_policy",),
         "adaafford.scans": ("ScanFrame", "checked_scan", "doubtful_up", "observation_of", "read_scan"),
-        "cluster.library": ("collect", "simulated", "train"),
-        "shared.adaptation": ("Adapter",),
+        "cluster.cli.library": ("collect", "simulated", "train"),
+        "shared.policies.adaptation": ("Adapter",),
         "shared.errors": ("AdaAffordError",),
-        "shared.policy": ("Policy",),
-        "shared.proposers": ("AipProposer", "ExploitProposer"),
+        "shared.policies.policy": ("Policy",),
+        "shared.policies.proposers": ("AipProposer", "ExploitProposer"),
         "shared.store": ("Store",),
-        "shared.vocabulary": (
+        "shared.types": (
             *("Action", "Environment", "Interaction", "Observation"),
             *("Outcome", "OutcomeKind", "Proposer"),
         ),

@@ -11,8 +11,8 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.plain import plain
-from shared.vocabulary import Float
+from shared.io.text import plain
+from shared.types import Float
 
 Columns = dict[str, NDArray[np.generic]]
 """Of a file: "points" [M, 3], and where it has them "normals" [M, 3], "movable" [M] and "camera" [3]."""

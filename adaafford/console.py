@@ -11,7 +11,7 @@ from typing import NoReturn
 
 def main() -> NoReturn:
     """Run the command line of this process and exit."""
-    import_module("cluster.cli").main()
+    import_module("cluster.cli.main").main()
     raise AssertionError("the command line ends the process")
 
 

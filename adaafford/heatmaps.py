@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import UsageError
-from shared.files import write_atomically
-from shared.vocabulary import Float, Float32
+from shared.io.files import write_atomically
+from shared.types import Float, Float32
 
 
 def write_heatmap(path: Path, points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> None:

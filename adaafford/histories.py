@@ -24,11 +24,11 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, field_va
 
 from adaafford.columns import shown, without_mark
 from adaafford.scans import ScanFrame, Vector, action_at
-from shared.configuration import StrictModel
-from shared.documents import named_twice
+from shared.config import StrictModel
 from shared.errors import UsageError
-from shared.files import read_bounded, write_atomically
-from shared.vocabulary import Action, Interaction, Observation, Outcome, OutcomeKind
+from shared.io.documents import named_twice
+from shared.io.files import read_bounded, write_atomically
+from shared.types import Action, Interaction, Observation, Outcome, OutcomeKind
 
 MAX_HISTORY_BYTES = 1 << 20
 MAX_TRIES = 64

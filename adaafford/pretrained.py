@@ -7,8 +7,8 @@ README.md, its model card (`adaafford export-policy` makes all three).
 from pathlib import Path
 
 from shared.errors import UsageError
-from shared.files import read_bounded
-from shared.policy import MAX_POLICY_JSON_BYTES, MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE, Policy
+from shared.io.files import read_bounded
+from shared.policies.policy import MAX_POLICY_JSON_BYTES, MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.store import Store
 
 PRETRAINED_FOLDER = Path(__file__).parent / "pretrained"

@@ -2,7 +2,7 @@
 
 A scan has a frame of its own, in metres: a camera's, or a robot's. `ScanFrame` says where that frame's *up* points
 (against gravity), where the camera stood in it, and which of its points is the object's middle; the world frame of
-`shared.vocabulary` has that point as its origin and z up. All scans of one object share one frame.
+`shared.types` has that point as its origin and z up. All scans of one object share one frame.
 
 Files are hostile until checked: bounded in size, finite, never pickled.
 
@@ -24,12 +24,12 @@ from adaafford.npz import read_npz
 from adaafford.pcd import read_pcd
 from adaafford.ply import read_ply
 from shared import seeds
-from shared.configuration import CameraConfig, StrictModel, parse
+from shared.config import CameraConfig, StrictModel, parse
 from shared.errors import UsageError
-from shared.files import read_bounded
 from shared.geometry import camera_pose, gripper_rotation
+from shared.io.files import read_bounded
 from shared.observation import furthest_first, round_normals, round_points
-from shared.vocabulary import Action, Float, Observation
+from shared.types import Action, Float, Observation
 
 MIN_POINTS, MAX_POINTS = 64, 1920 * 1080
 MAX_ROWS = 1 << 23

@@ -28,13 +28,13 @@ from adaafford.scans import (
     read_scan_file,
 )
 from shared import seeds
-from shared.adaptation import Adapter
-from shared.configuration import StrictModel
+from shared.config import StrictModel
 from shared.errors import UsageError
-from shared.plain import plain
-from shared.policy import Policy
-from shared.proposers import AipProposer, ExploitProposer
-from shared.vocabulary import Observation
+from shared.io.text import plain
+from shared.policies.adaptation import Adapter
+from shared.policies.policy import Policy
+from shared.policies.proposers import AipProposer, ExploitProposer
+from shared.types import Observation
 
 PURPOSE = "adapt"
 

@@ -15,16 +15,16 @@ import torch
 from pydantic import Field
 
 from benchmarks.script import main
-from cluster.commands.bench import StoredSettings, source_of, stored
-from shared.adaptation import Adapter
+from cluster.cli.commands.bench import StoredSettings, source_of, stored
 from shared.errors import UsageError
-from shared.networks.configuration import NetworkConfig
+from shared.networks.network_config import NetworkConfig
 from shared.observation import round_points
-from shared.policy import Policy
+from shared.policies.adaptation import Adapter
+from shared.policies.policy import Policy
+from shared.policies.proposers import AipProposer
 from shared.progress import Advance, Progress
-from shared.proposers import AipProposer
 from shared.store import Store
-from shared.vocabulary import Interaction, Observation, Outcome, OutcomeKind
+from shared.types import Interaction, Observation, Outcome, OutcomeKind
 
 SIZES = (2048, 4096, 10_000)
 """Points of a cloud: as collected here, and up to what was published."""

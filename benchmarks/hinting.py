@@ -18,19 +18,19 @@ from pydantic import Field
 
 from adaafford import load_policy
 from benchmarks.script import check_picture, main
-from cluster.adoption import seen_by, unknown
-from cluster.commands.bench import StoredSettings, source_of, stored
-from cluster.picture import Panel, draw_panels
+from cluster.cli.commands.bench import StoredSettings, source_of, stored
+from cluster.reporting.picture import Panel, draw_panels
 from cluster.reporting.words import verdict
-from learner.bootstrap import ratio_interval
-from shared.adaptation import Adapter
+from cluster.runs.warm_start import seen_by, unknown
+from learner.evaluation.bootstrap import ratio_interval
 from shared.errors import UsageError
 from shared.formatting import percent
-from shared.policy import Policy
+from shared.policies.adaptation import Adapter
+from shared.policies.policy import Policy
 from shared.progress import Advance, Progress
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
-from shared.vocabulary import Float, Float32, Interaction, Observation, Outcome
+from shared.types import Float, Float32, Interaction, Observation, Outcome
 
 Side = Literal["free", "hinge"]
 OUTER, INNER = 0.8, 0.2

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from benchmarks.script import main
 from benchmarks.straightforward import POINTS, PublishedStep
-from cluster.benchmarks.learning import NETWORKS, stages_of, training_rate
-from cluster.commands.bench import StoredSettings, source_of, stored
-from learner.configuration import LearnerConfig
-from learner.data import Dataset, load_dataset, split
-from learner.hardware import Hardware
-from learner.training import Stage
+from cluster.cli.benchmarks.learning import NETWORKS, stages_of, training_rate
+from cluster.cli.commands.bench import StoredSettings, source_of, stored
+from learner.data.dataset import Dataset, load_dataset, split
+from learner.settings import LearnerConfig
+from learner.training.hardware import Hardware
+from learner.training.loop import Stage
 from shared.progress import Progress
 from shared.seeds import generator
 

@@ -17,8 +17,8 @@ from shared.plan import Job, missing_ranges
 from shared.progress import Advance
 from shared.records import RolloutRecord
 from shared.store import Store
+from shared.store.codecs.checksummed import seal
 from shared.store.layout import MANIFEST_FILE
-from shared.store.sealed import seal
 
 COMMITS = 7
 """The median of these counts."""

@@ -17,12 +17,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from cluster.status import read_status
-from learner.data import load_dataset
-from shared.networks.configuration import NetworkConfig
+from cluster.collection.status_writer import read_status
+from learner.data.dataset import load_dataset
+from shared.networks.network_config import NetworkConfig
 from shared.plan import missing_ranges
 from shared.store import Store, compact, export, info, merge, repair, verify
-from shared.store.export import splits_by_share
+from shared.store.maintenance.export import splits_by_share
 from tests.support.fabricate import fabricate_store
 
 Progress = Callable[[int, int], None]

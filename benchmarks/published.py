@@ -14,11 +14,11 @@ from pydantic import Field
 from benchmarks import published_trial
 from benchmarks.published_trial import PublishedRequest, PublishedTiming
 from benchmarks.script import main
-from cluster.benchmarks.collecting import collect, jobs_of, summary
-from cluster.commands.bench import BenchSettings, planned, print_collection
-from collector.partnet import urdf_of
+from cluster.cli.benchmarks.collecting import collect, jobs_of, summary
+from cluster.cli.commands.bench import BenchSettings, planned, print_collection
+from collector.objects.partnet import urdf_of
 from shared.errors import WorkerError
-from shared.interpreter import PYTHON, own_environment
+from shared.io.interpreter import PYTHON, own_environment
 from shared.progress import Progress
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store

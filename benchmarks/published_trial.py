@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from collector.jointed_gripper import JointedGripper, on_arm
-from collector.primitives import Trial
-from collector.readers import read_object
-from collector.scene import Scene
-from shared.configuration import FIDELITIES, PUBLISHED_TIMING, StrictModel
+from collector.objects.readers import read_object
+from collector.sim.jointed_gripper import JointedGripper, on_arm
+from collector.sim.scene import Scene
+from collector.sim.trial import Trial
+from shared.config import FIDELITIES, PUBLISHED_TIMING, StrictModel
 from shared.primitives import PRIMITIVES
-from shared.vocabulary import Action, Direction, Float, HiddenDynamics, OutcomeKind
+from shared.types import Action, Direction, Float, HiddenDynamics, OutcomeKind
 
 STILL_STEPS, MOST_STEPS = 5000, 20_000
 """Where2Act's settling."""

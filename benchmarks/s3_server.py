@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from shared.errors import UsageError, WorkerError
-from shared.interpreter import PYTHON, own_environment
+from shared.io.interpreter import PYTHON, own_environment
 
 BUCKET = "adaafford"
 

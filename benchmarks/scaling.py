@@ -24,17 +24,17 @@ from pydantic import Field
 from benchmarks.listing import ListingBenchmark, StorePoint
 from benchmarks.script import check_picture, main
 from benchmarks.sleeping import Dormitories, Sleeper
-from cluster.commands.bench import StoredSettings, source_of, stored
-from cluster.orders import Series
-from cluster.progress import CollectionProgress
-from cluster.ray_fleet import RayFleet
-from cluster.session import ray_session
-from collector.guard import Limits
-from collector.receipt import Receipt
+from cluster.cli.commands.bench import StoredSettings, source_of, stored
+from cluster.collection.tally import CollectionProgress
+from cluster.workers.job_queue import Series
+from cluster.workers.ray_group import RayFleet
+from cluster.workers.session import ray_session
+from collector.job_result import Receipt
+from collector.watchdog import Limits
 from shared.errors import UsageError
 from shared.plan import Plan
 from shared.progress import Advance, Progress
-from shared.underway import Underway
+from shared.store.crash_log import Underway
 
 BEDS = 100
 """Of a dormitory."""

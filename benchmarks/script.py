@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from cluster.cli import begin_process, guarded
-from cluster.commands.bench import BenchSettings, flags_of, run_benchmark
-from cluster.settings import parse_flags
+from cluster.cli.commands.bench import BenchSettings, flags_of, run_benchmark
+from cluster.cli.main import begin_process, guarded
+from cluster.config.flags import parse_flags
 from shared.errors import UsageError
 
 Settings = TypeVar("Settings", bound=BenchSettings)

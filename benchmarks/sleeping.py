@@ -15,10 +15,10 @@ from typing import Any
 
 import ray
 
-from cluster.ray_fleet import Actor
-from collector.guard import UnderWay
-from collector.receipt import Receipt
-from shared.files import process_name
+from cluster.workers.ray_group import Actor
+from collector.job_result import Receipt
+from collector.watchdog import UnderWay
+from shared.io.files import process_name
 from shared.plan import Job, Plan
 
 INTERACTIONS = 32

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from benchmarks.s3_server import loopback_bucket
 from benchmarks.script import main
-from cluster.commands.bench import StoredSettings, source_of, stored
+from cluster.cli.commands.bench import StoredSettings, source_of, stored
 from shared.errors import StoreError
 from shared.plan import Job
 from shared.progress import Advance, Progress

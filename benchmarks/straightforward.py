@@ -10,9 +10,9 @@ Shapes: B clouds (one an interaction), N points, n centres, k neighbours, C chan
 import torch
 from torch import Tensor, nn
 
-from learner.losses import action_scoring_loss
+from learner.training.losses import action_scoring_loss
 from shared.networks.aap import Aap
-from shared.networks.configuration import NETWORKS, NetworkConfig
+from shared.networks.network_config import NETWORKS, NetworkConfig
 
 POINTS = 10_000
 LEARNING_RATE = 1e-4

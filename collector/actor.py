@@ -4,11 +4,11 @@ from collections.abc import Mapping
 
 import ray
 
-from collector.guard import Guard, Limits
-from collector.receipt import JobWorker, Receipt, WorkerFactory
-from shared.files import process_name
+from collector.job_result import JobWorker, Receipt, WorkerFactory
+from collector.watchdog import Guard, Limits
+from shared.io.files import process_name
 from shared.plan import Job, Plan
-from shared.underway import Underway
+from shared.store.crash_log import Underway
 
 
 class WorkerActor:

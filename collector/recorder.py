@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from collector.clock import StageClock
-from collector.proposers import RandomProposer
-from collector.simulator import SimEnvironment
+from collector.random_proposer import RandomProposer
+from collector.sim.simulator import SimEnvironment
+from collector.stopwatch import StageClock
 from shared.geometry import quaternion_from_rotation
 from shared.primitives import hand_start
 from shared.records import InteractionRecord
-from shared.vocabulary import Action, Float, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role
+from shared.types import Action, Float, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role
 
 
 def interact(

@@ -2,18 +2,18 @@
 
 import numpy as np
 
-from collector.articulation import ArticulatedObject
-from collector.clock import StageClock
-from collector.draws import Draw, draw_rollout
-from collector.evaluation import ProposerFactory, evaluate
-from collector.proposers import RandomProposer
+from collector.domain_randomisation import Draw, draw_rollout
+from collector.evaluation_rollout import ProposerFactory, evaluate
+from collector.objects.articulation import ArticulatedObject
+from collector.random_proposer import RandomProposer
 from collector.recorder import Recorder
-from collector.simulator import SIMULATORS, SimEnvironment
+from collector.sim.simulator import SIMULATORS, SimEnvironment
+from collector.stopwatch import StageClock
 from shared import seeds
 from shared.geometry import camera_pose
 from shared.plan import Plan
 from shared.records import RolloutRecord, RolloutStatus
-from shared.vocabulary import Order, Proposer, Role
+from shared.types import Order, Proposer, Role
 
 TRIES = 8
 """Draws of a camera and a state before a rollout is given up as showing nothing that could be acted upon."""
@@ -27,7 +27,7 @@ def run_rollout(
     Args:
         plan: what is collected.
         index: which of its rollouts.
-        target: the object that `collector.draws.object_of` names.
+        target: the object that `collector.domain_randomisation.object_of` names.
         make_proposer: makes the proposers that the plan needs.
         clock: sums wall time by stage.
     """

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from collector.grippers import GRIPPERS
-from collector.simulator import SIMULATORS
-from shared.configuration import CollectionConfig
+from collector.sim.grippers import GRIPPERS
+from collector.sim.simulator import SIMULATORS
+from shared.config import CollectionConfig
 from shared.errors import UsageError
 from shared.extensions import added_by_packages
 from shared.plan import EvaluationConfig, Setting, found_by_name

@@ -10,27 +10,27 @@ from types import MappingProxyType
 import numpy as np
 import psutil
 
-from collector.articulation import ArticulatedObject
-from collector.clock import StageClock
-from collector.draws import object_of
-from collector.guard import UnderWay
-from collector.object_cache import ObjectCache
-from collector.proposers import RandomProposer
-from collector.receipt import Receipt
+from collector.domain_randomisation import object_of
+from collector.job_result import Receipt
+from collector.objects.articulation import ArticulatedObject
+from collector.objects.cache import ObjectCache
+from collector.random_proposer import RandomProposer
 from collector.rollout import quarantined_rollout, run_rollout
 from collector.setting import check_packages
-from shared.adaptation import Adapter
-from shared.methods import PROPOSERS, needs_policy
+from collector.stopwatch import StageClock
+from collector.watchdog import UnderWay
+from shared.io.redaction import without_places
 from shared.plan import Job, Plan
-from shared.policy import Policy
-from shared.proposers import proposer_named
+from shared.policies.adaptation import Adapter
+from shared.policies.methods import PROPOSERS, needs_policy
+from shared.policies.policy import Policy
+from shared.policies.proposers import proposer_named
 from shared.records import RolloutRecord, RolloutStatus
-from shared.redaction import without_places
 from shared.reproduction import OBJECTS, STORE, reproduction
 from shared.store import Quarantined, Store
 from shared.store.layout import MAX_REASON
 from shared.store.provenance import note_machine
-from shared.vocabulary import Proposer
+from shared.types import Proposer
 
 NOTHING: Mapping[int, str] = MappingProxyType({})
 CACHED_POLICIES = 2

@@ -5,11 +5,11 @@
     collect-aip-1, train-aap-2, train-aip-2, publish-2, ...
 
 `alternation` is this order. `perform` does one of its steps. Where the rollouts come from is up to `Rollouts`: a store
-that grows no more (`Finished`), collectors that work beside the learner (`learner.following`), or a campaign, which
-collects them itself (`cluster.campaign`).
+that grows no more (`Finished`), collectors that work beside the learner (`learner.rounds`), or a campaign, which
+collects them itself (`cluster.campaign.campaign`).
 
 RUN/ of `alternate`
-    prior/, aap-1/, aip-1/, aap-2/, ...   one folder a training (see `learner.stages`), each resumable by itself
+    prior/, aap-1/, aip-1/, aap-2/, ...   one folder a training (see `learner.stages.jobs`), each resumable by itself
     alternation.json                      the rounds, which of them is the best, and why they ended; written last
 """
 
@@ -22,15 +22,15 @@ from typing import Any, Protocol
 
 from pydantic import BaseModel, Field
 
-from learner import sharing
-from learner.configuration import AlternationConfig, LearnerConfig
-from learner.hardware import Hardware
-from learner.stages import DONE_FILE, MAX_DONE_BYTES, Memory, StageJob, StageName, read_done, run_stage
-from shared.documents import read_document
+from learner.settings import AlternationConfig, LearnerConfig
+from learner.stages.jobs import DONE_FILE, MAX_DONE_BYTES, Memory, StageJob, StageName, read_done, run_stage
+from learner.training import data_parallel
+from learner.training.hardware import Hardware
 from shared.errors import StoreError, UsageError
-from shared.files import write_atomically
-from shared.methods import BaselineName
+from shared.io.documents import read_document
+from shared.io.files import write_atomically
 from shared.plan import parse_plan_key
+from shared.policies.methods import BaselineName
 from shared.store.store import Store
 
 ALTERNATION_FILE = "alternation.json"
@@ -209,7 +209,7 @@ def alternate(rollouts: Finished, config: LearnerConfig, hardware: Hardware | No
     for step in alternation(goes_on):
         perform(step, rollouts, lambda job: run_stage(job, config, hardware, memory))
     best = scores.index(min(scores)) + 1
-    if sharing.rank() == 0:
+    if data_parallel.rank() == 0:
         rounds = [{"round": number, "score": score} for number, score in enumerate(scores, start=1)]
         ended_early = len(scores) < config.alternation.rounds
         told = {"rounds": rounds, "best": best, "converged": ended_early}

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from shared.plain import csv_cell, plain
+from shared.io.text import csv_cell, plain
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -51,7 +51,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int
 
     Args:
         head: names of the columns, as Markdown.
-        rows: cells, as Markdown; texts from outside have gone through `shared.plain.markdown`.
+        rows: cells, as Markdown; texts from outside have gone through `shared.io.text.markdown`.
         left: how many of the first columns are aligned to the left; all others to the right.
     """
     alignment = ["---"] * left + ["---:"] * (len(head) - left)

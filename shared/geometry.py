@@ -7,7 +7,7 @@ object's. It keeps gravity pointing down and forgets the azimuth, which carries 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.vocabulary import Float, Observation
+from shared.types import Float, Observation
 
 
 def camera_pose(azimuth_deg: float, elevation_deg: float, distance: float) -> Float:

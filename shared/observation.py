@@ -7,7 +7,7 @@ Shapes: N points; any leading shape will do.
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.vocabulary import Float, Float32
+from shared.types import Float, Float32
 
 NORMAL_STEPS = 127
 
@@ -25,7 +25,7 @@ def furthest_first(points: Float | Float32, count: int, candidates: int, rng: np
         [count].
     """
     # Here, because Numba takes a third of a second to import and only those who observe need it.
-    from shared.furthest_points import furthest_points
+    from shared.policies.furthest_points import furthest_points
 
     chosen = np.arange(len(points))
     if len(points) > candidates:

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import FailFast, Field, model_validator
 
-from shared.configuration import CollectionConfig, DynamicsRanges, StrictModel
+from shared.config import CollectionConfig, DynamicsRanges, StrictModel
 from shared.extensions import Registry
-from shared.methods import BASELINES, METHODS, PROPOSERS, RANDOM, MethodName
+from shared.policies.methods import BASELINES, METHODS, PROPOSERS, RANDOM, MethodName
 from shared.tasks import TASKS, Task, Terms, task_named
 
 

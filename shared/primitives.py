@@ -7,7 +7,7 @@ it stands when the trial starts, with its origin moved to the touched point p; s
 from dataclasses import dataclass
 
 from shared.extensions import Registry
-from shared.vocabulary import Action, Float
+from shared.types import Action, Float
 
 START_DISTANCE = 0.15
 """From the hand frame's origin to p at the start, along the approach."""

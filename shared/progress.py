@@ -16,7 +16,7 @@ from rich.progress import BarColumn, ProgressColumn, SpinnerColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.text import Text
 
-from shared.plain import plain
+from shared.io.text import plain
 
 if TYPE_CHECKING:
     from rich.progress import Task

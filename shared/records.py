@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from shared.plan import ObjectRef
-from shared.vocabulary import Action, Float, HiddenDynamics, Observation, Order, Outcome, Role
+from shared.types import Action, Float, HiddenDynamics, Observation, Order, Outcome, Role
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-from shared.configuration import CollectionConfig, DynamicsRanges, Name, StrictModel, load_toml, parse
+from shared.config import CollectionConfig, DynamicsRanges, Name, StrictModel, load_toml, parse
 from shared.errors import UsageError
 from shared.extensions import Registry
-from shared.vocabulary import Direction
+from shared.types import Direction
 
 Word = Annotated[str, Field(min_length=1, max_length=64)]
 Words = Annotated[tuple[Word, ...], Field(max_length=1000)]

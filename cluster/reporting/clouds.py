@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from cluster.reporting.style import FAILURE, PROPOSED, SOFT, SUCCESS, laid_out
-from shared.vocabulary import Action, Float, Float32, Interaction, Observation
+from shared.types import Action, Float, Float32, Interaction, Observation
 
 MOVABLE_POINTS, STATIC_POINTS = 1200, 600
 """Kept of a cloud. Any prefix of a cloud in furthest-point order covers the object."""

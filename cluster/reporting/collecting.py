@@ -8,12 +8,12 @@ from typing import Any
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from cluster.ledger import Ledger
 from cluster.reporting.page import Cell, Drawing, Section, Table, plain, shortened
 from cluster.reporting.style import ACCENT, SECOND, laid_out
+from cluster.runs.run_log import Ledger
 from shared.store import Store
-from shared.store.info import quarantined_in
 from shared.store.layout import Quarantined
+from shared.store.maintenance.info import quarantined_in
 
 BAR_HEIGHT = 26
 MAX_ROWS = 50

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cluster.episodes import Episode
+from cluster.evaluation.trials import Episode
 from cluster.reporting.clouds import Arrow, CloudView, draw_panels
 from cluster.reporting.page import Drawing, Section, plain
 from cluster.reporting.style import FAILURE
 from cluster.reporting.words import hidden, verdict
-from shared.adaptation import Adapter
+from shared.policies.adaptation import Adapter
 from shared.records import InteractionRecord
 
 SHOWN = 4

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Sequence
 
 from cluster.reporting.clouds import CloudView, draw_panels, tried
-from cluster.reporting.laboratory import TRIES, Laboratory, Posterior, variations
+from cluster.reporting.counterfactuals import TRIES, Laboratory, Posterior, variations
 from cluster.reporting.page import Drawing, Section, plain, shortened
 from cluster.reporting.words import after
-from collector.articulation import ArticulatedObject
-from shared.adaptation import Adapter
+from collector.objects.articulation import ArticulatedObject
+from shared.policies.adaptation import Adapter
 
 
 def hidden_facts_section(

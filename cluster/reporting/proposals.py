@@ -3,12 +3,12 @@
 import numpy as np
 import plotly.graph_objects as go
 
-from cluster.episodes import Episode
+from cluster.evaluation.trials import Episode
 from cluster.reporting.clouds import CloudView, draw_panels, proposed, tried
 from cluster.reporting.page import Drawing, Section, plain, shortened
 from cluster.reporting.words import after, hidden, verdict
-from shared.adaptation import Adapter, movable_points
-from shared.vocabulary import Float32, Interaction, Observation
+from shared.policies.adaptation import Adapter, movable_points
+from shared.types import Float32, Interaction, Observation
 
 MOST_TRIES = 3
 """Two clouds a step; a browser draws no more than about sixteen at once."""

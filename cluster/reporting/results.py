@@ -7,13 +7,13 @@ from pathlib import Path
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from cluster.evaluation_tables import BEST_METHOD, MEASURES, ORDER, WITHOUT_TRIES, Measure, ResultRow, ResultRows
+from cluster.evaluation.published import published, published_figure
+from cluster.evaluation.tables import BEST_METHOD, MEASURES, ORDER, WITHOUT_TRIES, Measure, ResultRow, ResultRows
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
-from cluster.reporting.published import published, published_figure
 from cluster.reporting.style import COLOURS, SOFT, laid_out
-from cluster.run_folder import read_json
-from learner.evaluation import ORACLE_METHOD, PRIOR_METHOD
-from shared.configuration import parse
+from cluster.runs.run_folder import read_json
+from learner.evaluation.table import ORACLE_METHOD, PRIOR_METHOD
+from shared.config import parse
 from shared.formatting import number, percent
 
 

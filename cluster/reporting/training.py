@@ -12,7 +12,7 @@ from plotly.subplots import make_subplots
 from cluster.reporting.page import Drawing, Section, plain
 from cluster.reporting.style import SEQUENCE, laid_out
 from shared.errors import StoreError
-from shared.files import read_bounded
+from shared.io.files import read_bounded
 
 METRICS_FILE = "metrics.jsonl"
 MAX_METRICS_BYTES = 16 << 20

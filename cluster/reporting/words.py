@@ -1,7 +1,7 @@
 """What the page calls things: hidden facts, outcomes, numbers of tries."""
 
 from shared.hidden import hidden_parameter
-from shared.vocabulary import Direction, HiddenDynamics, Outcome
+from shared.types import Direction, HiddenDynamics, Outcome
 
 
 def hidden(dynamics: HiddenDynamics) -> str:

@@ -5,21 +5,21 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cluster.configuration import CampaignConfig
-from cluster.episodes import first_episodes, most_telling
-from cluster.evaluation_tables import RESULTS_FILE
-from cluster.ledger import Ledger
+from cluster.config.campaign_config import CampaignConfig
+from cluster.evaluation.tables import RESULTS_FILE
+from cluster.evaluation.trials import first_episodes, most_telling
 from cluster.reporting.collecting import collection_section
 from cluster.reporting.failures import failures_section
 from cluster.reporting.page import Page, Picture, Section, render, shortened
 from cluster.reporting.proposals import proposals_section
 from cluster.reporting.results import Results, further_section, read_results, results_section, tiles
 from cluster.reporting.training import training_section
-from cluster.run_folder import RunFolder, read_json
-from shared.adaptation import Adapter
+from cluster.runs.run_folder import RunFolder, read_json
+from cluster.runs.run_log import Ledger
 from shared.errors import UsageError
-from shared.files import read_bounded, write_atomically
-from shared.policy import Policy
+from shared.io.files import read_bounded, write_atomically
+from shared.policies.adaptation import Adapter
+from shared.policies.policy import Policy
 from shared.store import Store
 
 MAX_PICTURE_BYTES = 4 << 20
@@ -78,8 +78,8 @@ def _further(run: RunFolder) -> list[tuple[str, Results]]:
 
 def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Callable[[str], None]) -> Section:
     # Only here, since they need the simulator.
+    from cluster.reporting.counterfactuals import Laboratory, first_readable, hinge_twins
     from cluster.reporting.hidden_facts import hidden_facts_section
-    from cluster.reporting.laboratory import Laboratory, first_readable, hinge_twins
 
     used, setting = run.objects_used(), evaluation.setting
     try:

@@ -5,8 +5,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from shared.networks.actions import outcome_inputs, outcome_width
-from shared.networks.configuration import NetworkConfig
 from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features, present
+from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import PointNet2
 
 MIN_ATTENTION = 1e-4

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from shared.networks.configuration import NetworkConfig
+from shared.networks.network_config import NetworkConfig
 
 FRAME_WIDTH = 6
 MOTION_SCALE = 0.01

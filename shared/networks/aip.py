@@ -2,8 +2,8 @@
 
 from torch import Tensor, nn
 
-from shared.networks.configuration import NetworkConfig
 from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features, present
+from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import PointNet2
 
 SCORE_SCALE = 0.02

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from shared.networks.actions import PLACE_SCALE, action_inputs, action_width, in_gripper
-from shared.networks.configuration import NetworkConfig
+from shared.networks.network_config import NetworkConfig
 
 SURROUNDINGS_SCALE = 10.0
 """Offsets of the nearest points, some hundredths of a unit, come to some tenths."""

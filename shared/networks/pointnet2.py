@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shared.grouping import Grouping
-from shared.networks.configuration import NetworkConfig
+from shared.networks.grouping import Grouping
 from shared.networks.layers import Normalisation, PointwiseMlp
-from shared.vocabulary import Float32
+from shared.networks.network_config import NetworkConfig
+from shared.types import Float32
 
 _QUERIES = 256
 """Points whose surroundings are sought at once; bounds memory."""
@@ -30,7 +30,7 @@ class CloudBatch:
 
     Attributes:
         points: [B, N, 3], view frame, furthest-point order.
-        neighbours: for each level [B, n, k] (see `shared.grouping.Grouping`).
+        neighbours: for each level [B, n, k] (see `shared.networks.grouping.Grouping`).
         nearest: for each level [B, m, 3].
     """
 

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor, nn
 
 from shared.networks.actions import FRAME_WIDTH, orthonormal_frames
-from shared.networks.configuration import NetworkConfig
 from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, point_features, present
+from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import PointNet2
 
 

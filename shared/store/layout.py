@@ -9,8 +9,8 @@
         observations.zarr/           the clouds
         manifest.json                counts, checksums, content digests, provenance; written last
       policies/<version>/            whatever the learner publishes, and index.json
-      underway/                      breadcrumbs of live workers (`shared.underway`); no data
-      status/                        how the last collection stands (`cluster.status`); no data
+      underway/                      breadcrumbs of live workers (`shared.store.crash_log`); no data
+      status/                        how the last collection stands (`cluster.collection.status_writer`); no data
       aside/                         what `store repair` or `store compact` took out; no data, and nothing reads it
 
 Names that begin with ".tmp-" are work in progress or its remnants; names that begin with ".lock-" are locks.
@@ -23,11 +23,11 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from shared.configuration import StrictModel
-from shared.documents import MAX_VALUES, parse_object, problem_of
+from shared.config import StrictModel
 from shared.errors import SchemaVersionError, StoreError
+from shared.io.documents import MAX_VALUES, parse_object, problem_of
 from shared.plan import Job, Setting
-from shared.store.sealed import is_sealed, unsealed
+from shared.store.codecs.checksummed import is_sealed, unsealed
 
 SCHEMA_VERSION = 1
 """What the number promises, and when it grows, is told in docs/compatibility.md."""

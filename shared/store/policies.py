@@ -4,11 +4,11 @@ import hashlib
 import re
 from collections.abc import Collection, Mapping
 
-from shared.configuration import StrictModel
+from shared.config import StrictModel
 from shared.errors import StoreError
+from shared.store.backends.base import Folder, Place, Publication
+from shared.store.codecs.checksummed import seal
 from shared.store.layout import MAX_DOCUMENT_BYTES, POLICIES_FOLDER, SCHEMA_VERSION, FileEntry, parse_sealed
-from shared.store.place import Folder, Place, Publication
-from shared.store.sealed import seal
 
 INDEX_FILE = "index.json"
 MAX_POLICY_BYTES = (1 << 28) + (1 << 20)

@@ -13,13 +13,13 @@ from contextlib import contextmanager, suppress
 
 from pydantic import Field, ValidationError
 
-from shared.configuration import StrictModel
+from shared.config import StrictModel
 from shared.errors import MissingError, StoreError, UsageError
-from shared.files import is_gone, process_name
 from shared.heartbeat import Heartbeat
+from shared.io.files import is_gone, process_name
+from shared.store.backends.base import Place
+from shared.store.crash_log import workers_at_work
 from shared.store.layout import STATUS_FOLDER
-from shared.store.place import Place
-from shared.underway import workers_at_work
 
 DRIVER = "driver"
 """Name of the lock of whoever hands out jobs, and of whoever must not meet one."""
@@ -33,7 +33,7 @@ class Mark(StrictModel):
     """What a holder says of itself."""
 
     process: str = Field(max_length=200)
-    """As `shared.files.process_name` has it."""
+    """As `shared.io.files.process_name` has it."""
     alone: bool
     """Whether it must be the only one."""
     written: float = Field(ge=0)

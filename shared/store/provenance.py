@@ -17,10 +17,10 @@ from importlib import metadata
 from pathlib import Path
 
 from shared.errors import StoreError
-from shared.files import host_name, machine_name
-from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, fingerprint
+from shared.io.files import host_name, machine_name
+from shared.store.backends.base import Place
+from shared.store.codecs.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, fingerprint
 from shared.store.layout import STATUS_FOLDER
-from shared.store.place import Place
 
 SCHEMA = "schema"
 """Name of the fingerprint of the columns, beside the packages."""
@@ -60,7 +60,7 @@ def note_machine(place: Place) -> None:
 
 
 def host_of(place: Place, process: str) -> str:
-    """The host of a process, by its `shared.files.process_name`; "" if the store does not know it."""
+    """The host of a process, by its `shared.io.files.process_name`; "" if the store does not know it."""
     try:
         found = json.loads(place.read(_key(process.partition("-")[0]), _MAX_NOTE_BYTES))["host"]
     except (StoreError, ValueError, KeyError, TypeError, RecursionError):

@@ -12,8 +12,11 @@ from pydantic_core import from_json
 from shared.errors import StoreError
 from shared.plan import Job, ObjectRef
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
-from shared.store import observations
-from shared.store.columns import INTERACTION_COLUMNS, MAX_TEXT, ROLLOUT_COLUMNS, added_in, hidden_names
+from shared.store.backends.base import Folder, Place
+from shared.store.codecs import observations
+from shared.store.codecs.columns import INTERACTION_COLUMNS, MAX_TEXT, ROLLOUT_COLUMNS, added_in, hidden_names
+from shared.store.codecs.observations import ObservationArrays
+from shared.store.codecs.tables import column_values, read_table, size_limit, unknown_columns, with_added
 from shared.store.coverage import ROLLOUT_COLUMN, Part
 from shared.store.layout import (
     INTERACTIONS_FILE,
@@ -26,11 +29,8 @@ from shared.store.layout import (
     parse_manifest,
     parse_shard_id,
 )
-from shared.store.observations import ObservationArrays
-from shared.store.place import Folder, Place
-from shared.store.tables import column_values, read_table, size_limit, unknown_columns, with_added
 from shared.store.validity import MAX_PARTS, check_quarantined, check_rollouts
-from shared.vocabulary import (
+from shared.types import (
     Action,
     Direction,
     HiddenDynamics,

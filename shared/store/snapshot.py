@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from pydantic import Field
 
-from shared.configuration import StrictModel
+from shared.config import StrictModel
 from shared.store.coverage import Part
 
 

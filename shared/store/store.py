@@ -17,16 +17,20 @@ import numpy as np
 import pyarrow as pa
 
 from shared.errors import StoreError, UnreadableError, UsageError
-from shared.files import TEMPORARY_PREFIX
 from shared.hidden import hidden_parameter
+from shared.io.files import TEMPORARY_PREFIX
 from shared.plan import Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import policies, reader
-from shared.store.columns import added_in, interaction_columns, rollout_columns
-from shared.store.conformance import check_place
+from shared.store.backends.base import Folder, Place, is_url, place_of
+from shared.store.backends.conformance import check_place
+from shared.store.codecs.checksummed import seal
+from shared.store.codecs.columns import added_in, interaction_columns, rollout_columns
+from shared.store.codecs.digest import combined_digest
+from shared.store.codecs.observations import ObservationArrays
+from shared.store.codecs.tables import schema_of
 from shared.store.coverage import Part, parts_of
-from shared.store.difference import difference_of
-from shared.store.digest import combined_digest
+from shared.store.crash_log import UNDERWAY_FOLDER, Underway
 from shared.store.layout import (
     INTERACTIONS_FILE,
     LOCK_PREFIX,
@@ -43,15 +47,11 @@ from shared.store.layout import (
     parse_shard_id,
     parse_store_document,
 )
-from shared.store.observations import ObservationArrays
-from shared.store.place import Folder, Place, is_url, place_of
+from shared.store.maintenance.difference import difference_of
 from shared.store.presence import DRIVER
 from shared.store.provenance import store_software
-from shared.store.sealed import seal
 from shared.store.snapshot import Snapshot
-from shared.store.tables import schema_of
 from shared.store.writer import commit_shard
-from shared.underway import UNDERWAY_FOLDER, Underway
 
 MAX_SEED = 2**64 - 1
 _TABLES_AT_ONCE = 256
@@ -304,7 +304,7 @@ class Store:
         """A pyarrow table, one row an interaction; "shard" and "observation" (index in it) find a row's cloud.
 
         Args:
-            columns: names (see `shared.store.columns`); None: all. "shard" and "observation" always come. A hidden
+            columns: names (see `shared.store.codecs.columns`); None: all. "shard" and "observation" always come. A hidden
                 parameter that the store lacks has its default in every row, where the package that adds it says one.
             plan_keys: rows of these plans only; None: all.
 

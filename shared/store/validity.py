@@ -9,10 +9,10 @@ from shared.errors import StoreError
 from shared.hidden import ALWAYS_DRAWN
 from shared.plan import Job
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
-from shared.store.columns import MAX_TEXT
+from shared.store.codecs.columns import MAX_TEXT
+from shared.store.codecs.observations import check_observation
 from shared.store.layout import MAX_ALL_POINTS, MAX_ROWS, Quarantined
-from shared.store.observations import check_observation
-from shared.vocabulary import Float
+from shared.types import Float
 
 MAX_PARTS = 255
 """Movable parts that an object may have: part ids are bytes."""

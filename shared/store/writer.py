@@ -6,13 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from shared.errors import StoreError
+from shared.io.redaction import without_places
 from shared.plan import Job
 from shared.records import RolloutRecord
-from shared.redaction import without_places
 from shared.reproduction import OBJECTS, STORE, reproduction
-from shared.store import observations
-from shared.store.columns import InteractionRow, RolloutRow, interaction_columns, rollout_columns
-from shared.store.digest import rollout_digest
+from shared.store.backends.base import Folder, Place, Publication
+from shared.store.codecs import observations
+from shared.store.codecs.checksummed import seal
+from shared.store.codecs.columns import InteractionRow, RolloutRow, interaction_columns, rollout_columns
+from shared.store.codecs.digest import rollout_digest
+from shared.store.codecs.tables import table_bytes
 from shared.store.layout import (
     INTERACTIONS_FILE,
     MANIFEST_FILE,
@@ -27,11 +30,8 @@ from shared.store.layout import (
     parse_shard_id,
     schema_version,
 )
-from shared.store.place import Folder, Place, Publication
 from shared.store.provenance import process_provenance, store_software
 from shared.store.reader import is_committed, read_files, read_manifest, read_rollouts, shard_folder
-from shared.store.sealed import seal
-from shared.store.tables import table_bytes
 from shared.store.validity import check_quarantined, check_rollouts
 
 

@@ -18,14 +18,14 @@ from adaafford.histories import MAX_TRIES, History, TriedOutcome, read_history, 
 from adaafford.pretrained import PRETRAINED_FOLDER, load_policy, only_pretrained, pretrained_names
 from adaafford.scans import ScanFrame, action_at, checked_scan, observation_of
 from adaafford.sessions import Request, Session, SessionFiles, Step
-from cluster.cli import run as adaafford
-from cluster.commands.adapt import MAX_LINE_BYTES, lines_of
-from shared.adaptation import Adapter, frames_in_view
+from cluster.cli.commands.adapt import MAX_LINE_BYTES, lines_of
+from cluster.cli.main import run as adaafford
 from shared.errors import StoreError, UsageError
 from shared.geometry import camera_pose, gripper_rotation, points_in_view
-from shared.networks.configuration import NetworkConfig
-from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
-from shared.vocabulary import Action, Float, OutcomeKind
+from shared.networks.network_config import NetworkConfig
+from shared.policies.adaptation import Adapter, frames_in_view
+from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
+from shared.types import Action, Float, OutcomeKind
 from tests.support.fabricate import fabricate_observation
 from tests.support.finished_run import make_finished_run
 

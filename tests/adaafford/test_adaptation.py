@@ -5,17 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from shared.adaptation import (
+from shared.errors import UsageError
+from shared.networks.network_config import NetworkConfig
+from shared.policies.adaptation import (
     Adapter,
     action_from_frame,
     frames_in_view,
     movable_points,
 )
-from shared.errors import UsageError
-from shared.networks.configuration import NetworkConfig
-from shared.policy import Policy
-from shared.proposers import AipProposer, ExploitProposer
-from shared.vocabulary import Action, Interaction, Proposer
+from shared.policies.policy import Policy
+from shared.policies.proposers import AipProposer, ExploitProposer
+from shared.types import Action, Interaction, Proposer
 from tests.support.small_networks import TINY
 from tests.support.small_policies import history_of, observation_of, policy_of
 

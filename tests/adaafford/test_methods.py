@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from safetensors.torch import load, save
 
-from cluster.commands.run import main as run_command
-from shared.adaptation import Adapter, frames_in_view, movable_points
-from shared.critics import Critic, critic_named
+from cluster.cli.commands.run import main as run_command
 from shared.errors import StoreError, UsageError
-from shared.fps import LEAST_POINTS, THRESHOLD, FpsProposer, actionable_points, distances_to
-from shared.methods import (
+from shared.plan import EvaluationConfig
+from shared.policies.adaptation import Adapter, frames_in_view, movable_points
+from shared.policies.critics import Critic, critic_named
+from shared.policies.fps import LEAST_POINTS, THRESHOLD, FpsProposer, actionable_points, distances_to
+from shared.policies.methods import (
     METHODS,
     BaselineName,
     CriticName,
@@ -25,11 +26,10 @@ from shared.methods import (
     method_named,
     versions_of,
 )
-from shared.networks.where2act_interaction import TRIES, Where2ActInteraction
-from shared.plan import EvaluationConfig
-from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
-from shared.proposers import proposer_named
-from shared.vocabulary import Action, Interaction, Observation, Outcome, OutcomeKind
+from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
+from shared.policies.proposers import proposer_named
+from shared.policies.where2act_interaction import TRIES, Where2ActInteraction
+from shared.types import Action, Interaction, Observation, Outcome, OutcomeKind
 from tests.support.small_networks import TINY
 from tests.support.small_policies import BASELINES, CRITICS, history_of, observation_of, policy_with_all
 

@@ -28,7 +28,7 @@ from adaafford.scans import (
     read_scan,
 )
 from shared.errors import AdaAffordError, UsageError
-from shared.vocabulary import Float
+from shared.types import Float
 
 XYZ = (("float", "x"), ("float", "y"), ("float", "z"))
 NORMAL = (("float", "nx"), ("float", "ny"), ("float", "nz"))

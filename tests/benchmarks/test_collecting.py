@@ -12,17 +12,17 @@ import pytest
 
 from benchmarks.published import PublishedSettings, measure
 from benchmarks.script import run_script
-from cluster.benchmarks.dynamics import ALL, DynamicsTrial, by_category
-from cluster.benchmarks.fidelity import PairedTrial, compare, summarise
-from cluster.cli import run
-from cluster.commands.bench import keep
-from collector.catalogue import scan
-from collector.procedural import generate
-from shared.configuration import CameraConfig, CollectionConfig, Fidelity, Timing
+from cluster.cli.benchmarks.dynamics import ALL, DynamicsTrial, by_category
+from cluster.cli.benchmarks.fidelity import PairedTrial, compare, summarise
+from cluster.cli.commands.bench import keep
+from cluster.cli.main import run
+from collector.objects.catalogue import scan
+from collector.objects.procedural import generate
+from shared.config import CameraConfig, CollectionConfig, Fidelity, Timing
 from shared.errors import UsageError
 from shared.formatting import finite
 from shared.plan import Plan, Setting
-from shared.vocabulary import Outcome, OutcomeKind
+from shared.types import Outcome, OutcomeKind
 
 HASTE = Timing(steps_per_second=120, leg_steps=60, hold_steps=30)
 COARSE = Fidelity(name="coarse", approach=HASTE, drag=HASTE)
@@ -167,7 +167,9 @@ def test_what_is_not_a_number_becomes_null_and_an_unwritable_folder_is_named(tmp
 @pytest.mark.slow
 def test_a_fleet_makes_what_one_worker_makes(objects: Path) -> None:
     flags = ["--rollouts", "2", "--repeats", "1", "--collection.rollout.interactions", "2"]
-    script = "from cluster.cli import main; main()"  # In a process of its own: Ray wants to be imported before SAPIEN.
+    script = (
+        "from cluster.cli.main import main; main()"  # In a process of its own: Ray wants to be imported before SAPIEN.
+    )
     command = [sys.executable, "-c", script, "bench", "collect", "--objects", str(objects), *flags]
     done = subprocess.run([*command, "--workers", "2", "--json"], capture_output=True, text=True, check=True)
     found = json.loads(done.stdout.splitlines()[-1])

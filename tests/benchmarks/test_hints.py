@@ -15,7 +15,7 @@ from benchmarks.hinting import HintSettings, distance_from_axis, hints_of, measu
 from benchmarks.script import run_script
 from shared.plan import Job, Plan
 from shared.records import InteractionRecord, RolloutRecord
-from shared.vocabulary import Float32, Interaction, Observation, Outcome, OutcomeKind
+from shared.types import Float32, Interaction, Observation, Outcome, OutcomeKind
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting
 from tests.support.small_trainings import make_store
 

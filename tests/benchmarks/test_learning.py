@@ -12,13 +12,12 @@ from benchmarks.adapting import SIZES, AdaptSettings, resized
 from benchmarks.learning import PARTS, LearningSettings, StepApart
 from benchmarks.script import run_script
 from benchmarks.straightforward import PublishedEncoder, PublishedStep, ball_neighbours, furthest_points
-from cluster.benchmarks.learning import NETWORKS as CRITICS
-from cluster.benchmarks.learning import stages_of
-from cluster.cli import run
-from learner import configuration
-from learner.configuration import AapConfig, AipConfig, LearnerConfig, PriorConfig
-from learner.data import load_dataset, split
-from shared.networks.configuration import NETWORKS
+from cluster.cli.benchmarks.learning import NETWORKS as CRITICS
+from cluster.cli.benchmarks.learning import stages_of
+from cluster.cli.main import run
+from learner.data.dataset import load_dataset, split
+from learner.settings import AapConfig, AipConfig, LearnerConfig, PriorConfig
+from shared.networks.network_config import NETWORKS
 from shared.networks.pointnet2 import PointNet2
 from shared.store.store import Store
 from tests.support.small_networks import TINY

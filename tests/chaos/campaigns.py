@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.configuration import CampaignConfig
-from learner.configuration import AlternationConfig
-from shared.policy import POLICY_FILE, WEIGHTS_FILE
+from cluster.config.campaign_config import CampaignConfig
+from learner.settings import AlternationConfig
+from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
 from tests.chaos.counts import Counts
 from tests.chaos.killer import Campaign, Killer
 from tests.chaos.processes import Marked, Role

@@ -12,7 +12,7 @@ import psutil
 
 ROOT = Path(__file__).parents[2]
 MARK = "ADAAFFORD_CHAOS_MARK"
-PROGRAM = "import sys; from cluster.cli import main; main()"
+PROGRAM = "import sys; from cluster.cli.main import main; main()"
 LEARNING = {"train", "learn"}
 
 
@@ -103,6 +103,6 @@ def role_of(process: psutil.Process) -> Role | None:
         return Role.GCS
     if PROGRAM in command[:3]:
         return Role.LEARNER if command[3] in LEARNING else Role.DRIVER
-    if "cluster.children" in command[1:4]:
+    if "cluster.runs.subprocesses" in command[1:4]:
         return Role.LEARNER
     return None

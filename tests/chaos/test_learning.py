@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from cluster.run_folder import RunFolder
+from cluster.runs.run_folder import RunFolder
 from shared.store import Store
 from tests.chaos.campaigns import (
     BESIDE,

@@ -4,8 +4,8 @@ import hashlib
 from collections import Counter
 
 from shared.store import Store, verify
+from shared.store.backends.base import place_of
 from shared.store.layout import MANIFEST_FILE, MAX_DOCUMENT_BYTES, SHARDS_FOLDER, STORE_FILE
-from shared.store.place import place_of
 
 
 class Witness:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cluster.cli import COMMANDS, run
+from cluster.cli.main import COMMANDS, run
 from shared.categories import TEST_CATEGORIES
 
 
@@ -25,7 +25,7 @@ def complaint(capsys: pytest.CaptureFixture[str], *args: str) -> str:
 
 def test_help_imports_nothing_heavy() -> None:
     script = (
-        "import sys; from cluster.cli import run; assert run(['--help']) == 0;"
+        "import sys; from cluster.cli.main import run; assert run(['--help']) == 0;"
         "print(sorted({'torch', 'ray', 'sapien', 'zarr', 'matplotlib', 'tyro', 'numpy'} & sys.modules.keys()))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -123,7 +123,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("columns", ["0", "1"])
 def test_a_terminal_without_columns_is_written_to(columns: str) -> None:
     script = (
-        "from cluster.cli import begin_process; begin_process()\n"
+        "from cluster.cli.main import begin_process; begin_process()\n"
         "from rich.console import Console; Console().print('all of it')"
     )
     told = {**os.environ, "COLUMNS": columns}
@@ -132,7 +132,7 @@ def test_a_terminal_without_columns_is_written_to(columns: str) -> None:
 
 
 def test_threads_that_wait_for_each_other_do_not_keep_a_busy_processor_for_long() -> None:
-    begin = "from cluster.cli import begin_process; begin_process()"
+    begin = "from cluster.cli.main import begin_process; begin_process()"
     script = f"import os; {begin}; print(os.environ.get('GOMP_SPINCOUNT'), flush=True)"
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
     for given, spins in (({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "passive"}, "None"), ({}, "30000")):

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from cluster import cli
-from cluster.logs import JsonLines, Lines
-from cluster.selection import RayAddress
+from cluster.cli import main
+from cluster.config.selection import RayAddress
+from cluster.runs.logs import JsonLines, Lines
 from shared.errors import UsageError
-from shared.redaction import without_places, without_secrets
+from shared.io.redaction import without_places, without_secrets
 
 SECRET = "correct-horse-battery"  # noqa: S105 - it opens nothing.
 
@@ -47,15 +47,15 @@ def test_every_way_of_a_message_hides_them(capsys: pytest.CaptureFixture[str]) -
     def interrupt() -> int:
         raise KeyboardInterrupt
 
-    assert cli.guarded(fail, ["run"]) == 2
-    assert cli.guarded(interrupt, ["collect", "--ray-address", f"ray://me:{SECRET}@host"]) == 130
+    assert main.guarded(fail, ["run"]) == 2
+    assert main.guarded(interrupt, ["collect", "--ray-address", f"ray://me:{SECRET}@host"]) == 130
     record = logging.LogRecord("cluster", logging.ERROR, "", 0, "%s", (told,), None)
     print(Lines().format(record), JsonLines().format(record))
     json.loads(JsonLines().format(record))
     try:
         raise RuntimeError(told)
     except RuntimeError as error:
-        cli._show_traceback(type(error), error, error.__traceback__)
+        main._show_traceback(type(error), error, error.__traceback__)
     out, err = capsys.readouterr()
     assert SECRET not in out + err
     assert (out + err).count("***@host") == 5

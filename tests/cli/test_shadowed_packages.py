@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from adaafford.packages import PACKAGES, ROOT
-from shared.interpreter import PYTHON, own_environment
+from shared.io.interpreter import PYTHON, own_environment
 
 COMMAND = "import sys; sys.argv[0] = 'adaafford'; from adaafford.console import main; main()"
 FACE = "import adaafford"
@@ -58,7 +58,7 @@ def test_processes_of_ours_do_not_look_into_the_working_folder(tmp_path: Path) -
     for name in PACKAGES:
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise SystemExit('an intruder')")
-    code = "import adaafford, cluster.children, collector, learner, shared; print(shared.__file__)"
+    code = "import adaafford, cluster.runs.subprocesses, collector, learner, shared; print(shared.__file__)"
     done = subprocess.run(
         [*PYTHON, "-c", code], cwd=tmp_path, env=own_environment(), capture_output=True, text=True, check=True
     )

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from cluster.cli import COMMANDS
-from collector.procedural.writing import generate
+from cluster.cli.main import COMMANDS
+from collector.objects.procedural.writing import generate
 from shared.plan import Job, Plan
-from shared.policy import Policy
+from shared.policies.policy import Policy
 from shared.store import Store
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 from tests.support.finished_run import SMALL_NETWORK, make_finished_run
@@ -144,7 +144,7 @@ def test_a_reader_that_has_enough_ends_the_command_without_a_word(folder: Path) 
 
 def test_a_closed_stream_takes_no_file_of_ours(folder: Path) -> None:
     # Without /dev/null in its place, the first file that is opened would have the number of the standard output.
-    code = "from cluster.cli import begin_process; begin_process(); import os\n"
+    code = "from cluster.cli.main import begin_process; begin_process(); import os\n"
     code += "print('lost'); file = os.open('made', os.O_CREAT | os.O_WRONLY); assert file > 2, file\n"
     code += "os.write(1, b'by a library'); assert input_is_empty()"
     code = code.replace("input_is_empty()", "__import__('sys').stdin.read() == ''")
@@ -157,7 +157,7 @@ def test_a_closed_stream_takes_no_file_of_ours(folder: Path) -> None:
 def test_long_work_goes_on_when_its_reader_has_gone(tmp_path: Path) -> None:
     code = (
         "import sys; sys.argv = ['adaafford', 'train', 'prior']\n"
-        "import cluster.commands.train as train, cluster.cli as cli\n"
+        "import cluster.cli.commands.train as train, cluster.cli.main as cli\n"
         "def long(args):\n"
         "    for step in range(20000): print('step', step, flush=step % 100 == 0)\n"
         "    open('done', 'w').close()\n"
@@ -188,7 +188,7 @@ def test_a_terminal_that_goes_away_ends_a_command_in_an_orderly_way_unless_told_
     script = (
         "import os, signal, time, sys\n"
         f"signal.signal(signal.SIGHUP, {'signal.SIG_IGN' if ignored else 'signal.SIG_DFL'})\n"
-        "from cluster.cli import begin_process; begin_process()\n"
+        "from cluster.cli.main import begin_process; begin_process()\n"
         "try: os.kill(os.getpid(), signal.SIGHUP); time.sleep(0.1)\n"
         "finally: open('tidied', 'w').close()"
     )
@@ -198,7 +198,7 @@ def test_a_terminal_that_goes_away_ends_a_command_in_an_orderly_way_unless_told_
 
 
 def test_what_an_encoding_lacks_is_written_with_backslashes() -> None:
-    code = "from cluster.cli import begin_process; begin_process(); print('caf\\u00e9 \\udcff', flush=True)"
+    code = "from cluster.cli.main import begin_process; begin_process(); print('caf\\u00e9 \\udcff', flush=True)"
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONPATH": str(Path(__file__).parents[2])}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
     assert done.stdout == b"caf\\xe9 \\udcff\n"
@@ -207,11 +207,11 @@ def test_what_an_encoding_lacks_is_written_with_backslashes() -> None:
 def test_what_the_system_refuses_is_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from cluster import cli
+    from cluster.cli import main
 
     def full() -> int:
         raise OSError(28, "No space left on device", "runs/a/log.jsonl")
 
-    assert cli.guarded(full, ["run"]) == 1
+    assert main.guarded(full, ["run"]) == 1
     said = capsys.readouterr().err
     assert said == "adaafford: runs/a/log.jsonl: No space left on device; see to this and run the same command again\n"

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.cli import run as adaafford
-from cluster.logs import JsonLines, Lines
+from cluster.cli.main import run as adaafford
+from cluster.runs.logs import JsonLines, Lines
 from shared.formatting import csv_table
-from shared.plain import csv_cell, markdown, plain
+from shared.io.text import csv_cell, markdown, plain
 
 HOSTILE = "a\x1b]0;x\x07\r\nforged\u202etxt\u200b|<img src=x onerror=y>[red]`=1+1"
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cluster.cli import run as adaafford
-from cluster.configuration import CampaignConfig
-from cluster.evaluation_tables import RESULTS_FILE
-from cluster.pooling import (
+from cluster.cli.main import run as adaafford
+from cluster.config.campaign_config import CampaignConfig
+from cluster.evaluation.tables import RESULTS_FILE
+from cluster.reporting.aggregation import (
     CSV_FILE,
     FIGURE_FILE,
     JSON_FILE,
@@ -21,9 +21,9 @@ from cluster.pooling import (
     pool,
     write_comparison,
 )
-from cluster.run_folder import ObjectsUsed, begin
-from learner.bootstrap import ratio_interval
-from shared.configuration import CollectionConfig
+from cluster.runs.run_folder import ObjectsUsed, begin
+from learner.evaluation.bootstrap import ratio_interval
+from shared.config import CollectionConfig
 from shared.errors import UsageError
 from shared.plan import EvaluationConfig, ObjectRef, Setting
 from shared.store import Store

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from learner.alternation import ADOPTED, AlternationStep, Collect, Publish, Train, alternation, perform
 from shared.heartbeat import Heartbeat
-from shared.methods import BaselineName
+from shared.policies.methods import BaselineName
 
 BASELINES: tuple[BaselineName, ...] = ("where2act-interaction", "where2act-adaptation")
 

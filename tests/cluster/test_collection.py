@@ -8,20 +8,20 @@ from pathlib import Path
 
 import pytest
 
-from cluster.campaign import steps_of
-from cluster.collection import collect
-from cluster.configuration import CampaignConfig
-from cluster.fleet import Fleet, SerialFleet
-from cluster.progress import CollectionProgress
-from cluster.session import Crew
-from collector.guard import UnderWay
-from collector.receipt import Receipt, WorkerFactory
+from cluster.campaign.campaign import steps_of
+from cluster.collection.driver import collect
+from cluster.collection.tally import CollectionProgress
+from cluster.config.campaign_config import CampaignConfig
+from cluster.workers.session import Crew
+from cluster.workers.worker_group import Fleet, SerialFleet
+from collector.job_result import Receipt, WorkerFactory
+from collector.watchdog import UnderWay
 from shared.errors import StoreError, UsageError, WorkerError
-from shared.files import DRIVER_LOCK, exclusive_lock
+from shared.io.files import DRIVER_LOCK, exclusive_lock
 from shared.plan import Job, Plan
 from shared.progress import LINE_EVERY_S
 from shared.store import Store, verify
-from shared.underway import Underway
+from shared.store.crash_log import Underway
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
 
 OBJECTS = Path("objects")
@@ -91,7 +91,7 @@ def test_a_policy_that_is_not_there_is_refused(store: Store) -> None:
 
 def test_a_second_driver_is_refused_while_the_first_lives(tmp_path: Path) -> None:
     script = (
-        "import sys, pathlib; from shared.files import DRIVER_LOCK, exclusive_lock\n"
+        "import sys, pathlib; from shared.io.files import DRIVER_LOCK, exclusive_lock\n"
         "with exclusive_lock(pathlib.Path(sys.argv[1]) / DRIVER_LOCK): print('held', flush=True); sys.stdin.read()"
     )
     first = subprocess.Popen(
@@ -193,7 +193,7 @@ def adaafford(folder: Path, command: str, run: Path, workers: str) -> "subproces
 
     (folder / "small.toml").write_text(as_toml(SMALL))
     where = [str(run)] if command == "resume" else ["--out", str(run), "--config", str(folder / "small.toml")]
-    program = "import sys; from cluster.cli import main; main()"
+    program = "import sys; from cluster.cli.main import main; main()"
     with (folder / f"{run.name}.log").open("a") as log:
         return subprocess.Popen(
             [sys.executable, "-c", program, command, *where, "--workers", workers], stdout=log, stderr=log
@@ -203,7 +203,7 @@ def adaafford(folder: Path, command: str, run: Path, workers: str) -> "subproces
 def wait_for_stage(run: Path, name: str) -> None:
     import time
 
-    from cluster.ledger import Ledger
+    from cluster.runs.run_log import Ledger
 
     deadline = time.monotonic() + 200
     while name not in Ledger(run / "log.jsonl").seconds:

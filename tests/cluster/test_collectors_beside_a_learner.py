@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from learner.configuration import AlternationConfig
+from learner.settings import AlternationConfig
 from shared.store import Store, verify
 from tests.support.as_toml import as_toml
 from tests.support.small_trainings import FAST
@@ -25,7 +25,7 @@ PATIENCE_S = 200
 
 
 def adaafford(folder: Path, *arguments: str) -> "subprocess.Popen[bytes]":
-    program = "import sys; from cluster.cli import main; main()"
+    program = "import sys; from cluster.cli.main import main; main()"
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     with (folder / f"{arguments[0]}.log").open("a") as log:
         command = [sys.executable, "-c", program, *arguments]

@@ -10,13 +10,13 @@ import tyro
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.cli import run
-from cluster.configuration import EXECUTION_SETTINGS, CampaignConfig, RolloutCounts
-from cluster.evaluation_settings import EvaluateSettings
-from cluster.run_folder import begin, find
-from cluster.settings import early_flags, layered, parse_flags, preset_names
+from cluster.cli.main import run
+from cluster.config.campaign_config import EXECUTION_SETTINGS, CampaignConfig, RolloutCounts
+from cluster.config.evaluation_settings import EvaluateSettings
+from cluster.config.flags import early_flags, layered, parse_flags, preset_names
+from cluster.runs.run_folder import begin, find
 from shared.errors import UsageError
-from shared.store.difference import differences
+from shared.store.maintenance.difference import differences
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cluster.campaign import steps_of
-from cluster.cli import run as adaafford
-from cluster.configuration import CampaignConfig, RolloutCounts
-from cluster.estimate import RATES, Estimate, Rates, StageCost, estimate, multiply_adds
-from cluster.settings import layered
+from cluster.campaign.campaign import steps_of
+from cluster.campaign.estimate import RATES, Estimate, Rates, StageCost, estimate, multiply_adds
+from cluster.cli.main import run as adaafford
+from cluster.config.campaign_config import CampaignConfig, RolloutCounts
+from cluster.config.flags import layered
 from learner.alternation import Publish
-from shared.methods import METHODS
-from shared.networks.configuration import NETWORKS
+from shared.networks.network_config import NETWORKS
+from shared.policies.methods import METHODS
 
 RATE_VALUES = {name: rate for name, rate in dataclasses.asdict(RATES).items() if name != "measured"}
 

@@ -11,23 +11,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.blame import JobError
-from cluster.cli import run as adaafford
-from cluster.evaluation import PROPOSER, Evaluation
-from cluster.evaluation_of_run import evaluate_run
-from cluster.evaluation_settings import EvaluateSettings
-from cluster.evaluation_tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
-from cluster.judging import judge
-from cluster.session import Crew
-from collector.procedural.writing import generate
+from cluster.cli.main import run as adaafford
+from cluster.config.evaluation_settings import EvaluateSettings
+from cluster.evaluation.evaluate import PROPOSER, Evaluation
+from cluster.evaluation.policy_evaluation import judge
+from cluster.evaluation.run_evaluation import evaluate_run
+from cluster.evaluation.tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
+from cluster.workers.retries import JobError
+from cluster.workers.session import Crew
+from collector.objects.procedural.writing import generate
 from collector.worker import Worker
-from learner.bootstrap import ratio_interval
-from learner.evaluation import EvaluationRow, ObjectCounts
+from learner.evaluation.bootstrap import ratio_interval
+from learner.evaluation.table import EvaluationRow, ObjectCounts
 from learner.metrics import f_score
 from shared.errors import UsageError
 from shared.formatting import csv_table
-from shared.methods import METHODS
 from shared.plan import EvaluationConfig, Plan, Setting
+from shared.policies.methods import METHODS
 from shared.store import Store
 from tests.support.finished_run import make_finished_run
 
@@ -92,9 +92,9 @@ def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
 @pytest.mark.parametrize("name", sorted(METHODS.names()))
 def test_a_method_needs_the_networks_that_its_proposers_check_and_no_other(name: str) -> None:
     """Asked too little, a worker would meet the missing network in the middle of a collection."""
-    from shared.adaptation import Adapter
-    from shared.policy import Policy
-    from shared.proposers import proposer_named
+    from shared.policies.adaptation import Adapter
+    from shared.policies.policy import Policy
+    from shared.policies.proposers import proposer_named
     from tests.support.finished_run import SMALL_NETWORK
 
     method = METHODS.get(name)
@@ -152,7 +152,7 @@ def test_where2act_stands_at_every_budget_and_the_oracle_closes_the_gap(
     rows = [row_of("where2act", 0, 0.2), row_of("oracle", 0, 0.7), row_of("ours-final", 4, 0.6)]
     no_gap = [*rows[::2], row_of("oracle", 0, 0.1)]
     for known, closed in ((rows, {0.0, 1.0, 0.8}), (rows[::2], {None}), (no_gap, {None})):
-        monkeypatch.setattr("cluster.judging.evaluate_store", lambda *_, known=known: known)
+        monkeypatch.setattr("cluster.evaluation.policy_evaluation.evaluate_store", lambda *_, known=known: known)
         table = judge(evaluation, 1, tmp_path / "no-oracle")
         assert [row["budget"] for row in table.rows if row["method"] == "where2act"] == [1, 4]
         assert {row["gap_closed"] and round(row["gap_closed"], 9) for row in table.rows} == closed
@@ -187,7 +187,7 @@ def test_what_was_trained_on_is_never_tested_on(
         tested.append(evaluation.store.setting.objects)
         (evaluation.out / MARKDOWN_FILE).write_text("")
 
-    monkeypatch.setattr("cluster.evaluation_of_run._execute", pretend)
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._execute", pretend)
     used = json.loads((finished / "objects.json").read_bytes())
     for objects in (None, finished / "objects"):
         evaluate_run(finished, FAST.model_copy(update={"objects": objects}), tmp_path / f"out-{objects is None}")

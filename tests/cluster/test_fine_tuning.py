@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 
 from adaafford.pretrained import load_policy
-from cluster.adoption import adopt, seen_by
-from cluster.campaign import steps_of
-from cluster.cli import run as adaafford
-from cluster.configuration import CampaignConfig
-from cluster.estimate import estimate
-from cluster.evaluation_of_run import evaluate_run
-from cluster.evaluation_settings import EvaluateSettings
-from cluster.run_folder import RunFolder
-from collector.catalogue import scan
-from collector.procedural import generate
-from learner.stages import read_policy_folder
+from cluster.campaign.campaign import steps_of
+from cluster.campaign.estimate import estimate
+from cluster.cli.main import run as adaafford
+from cluster.config.campaign_config import CampaignConfig
+from cluster.config.evaluation_settings import EvaluateSettings
+from cluster.evaluation.run_evaluation import evaluate_run
+from cluster.runs.run_folder import RunFolder
+from cluster.runs.warm_start import adopt, seen_by
+from collector.objects.catalogue import scan
+from collector.objects.procedural import generate
+from learner.stages.jobs import read_policy_folder
 from shared.plan import ObjectRef
 from shared.store import Store
 from tests.support.as_toml import as_toml

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.cli import run
-from cluster.collection import Newest, collect
-from cluster.commands.collect import CollectCommand
-from cluster.fleet import SerialFleet
-from cluster.in_force import LOOK_S, PlanInForce
-from cluster.orders import Series
-from cluster.status import read_status
-from collector.guard import UnderWay
-from collector.receipt import Receipt
+from cluster.cli.commands.collect import CollectCommand
+from cluster.cli.main import run
+from cluster.collection.driver import Newest, collect
+from cluster.collection.status_writer import read_status
+from cluster.workers.job_queue import Series
+from cluster.workers.policy_source import LOOK_S, PlanInForce
+from cluster.workers.worker_group import SerialFleet
+from collector.job_result import Receipt
+from collector.watchdog import UnderWay
 from shared.errors import WorkerError
 from shared.plan import Job, Plan, missing_ranges
 from shared.store import Store, verify
@@ -80,7 +80,7 @@ def held(store: Store) -> dict[int, list[int]]:
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """New policies are seen at once, as though shards took long."""
-    monkeypatch.setattr("cluster.in_force.LOOK_S", 0.0)
+    monkeypatch.setattr("cluster.workers.policy_source.LOOK_S", 0.0)
 
 
 @pytest.mark.usefixtures("at_once")
@@ -216,7 +216,7 @@ def test_a_policy_is_a_version_or_the_latest(
     flags: list[str], policy: int | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     understood: list[CollectCommand] = []
-    monkeypatch.setattr("cluster.commands.collect._collect", understood.append)
+    monkeypatch.setattr("cluster.cli.commands.collect._collect", understood.append)
     assert run(["collect", "--store", "S", *flags]) == 0
     assert understood[0].policy == policy
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from cluster.children import OUTPUT_FILE, THREADS, Child
+from cluster.runs.subprocesses import OUTPUT_FILE, THREADS, Child
 from shared.errors import UsageError, WorkerError
 
 STAND_IN = "learner_stand_in"
@@ -76,7 +76,7 @@ def test_an_interrupt_ends_it(learner: Path, tmp_path: Path) -> None:
 
     with closing(Child(interrupt)) as child, pytest.raises(KeyboardInterrupt):
         child.run(f"{STAND_IN}:act", {"what": "hang"}, tmp_path)
-    assert not [child for child in psutil.Process().children() if "cluster.children" in child.cmdline()]
+    assert not [child for child in psutil.Process().children() if "cluster.runs.subprocesses" in child.cmdline()]
 
 
 def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> 
         [
             sys.executable,
             "-uc",
-            "import pathlib; from cluster.children import Child;"
+            "import pathlib; from cluster.runs.subprocesses import Child;"
             f"Child(print).run('{STAND_IN}:act', {{'what': 'hang'}}, pathlib.Path({str(tmp_path)!r}))",
         ],
         stdout=subprocess.PIPE,

@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 from ray.util.metrics import Gauge, Metric
 
-from cluster import metrics
-from cluster.metrics import FleetMetrics
-from collector.receipt import Receipt
+from cluster.workers import metrics
+from cluster.workers.metrics import FleetMetrics
+from collector.job_result import Receipt
 from shared.plan import Plan
-from shared.vocabulary import OutcomeKind
+from shared.types import OutcomeKind
 from tests.support.fabricate import fabricate_setting
 
 LABELS = {"task", "proposer", "outcome", "stage", "cause"}

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cluster.configuration import CampaignConfig, LearnerSettings, RolloutCounts
-from shared.interpreter import PYTHON, own_environment
+from cluster.config.campaign_config import CampaignConfig, LearnerSettings, RolloutCounts
+from shared.io.interpreter import PYTHON, own_environment
 from shared.plan import EvaluationConfig
 from shared.store import Store, verify
 from tests.support.as_toml import as_toml

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from cluster.adoption import seen_by
-from cluster.campaign import Campaign
-from cluster.cli import run as adaafford
-from cluster.configuration import CampaignConfig, SplitConfig
-from cluster.evaluation_of_run import _default_out
-from cluster.model_card import PROCEDURAL, source_of_run
-from cluster.run_folder import RunFolder, begin, find
-from collector.catalogue import scan
-from collector.procedural.writing import generate
+from cluster.campaign.campaign import Campaign
+from cluster.cli.main import run as adaafford
+from cluster.config.campaign_config import CampaignConfig, SplitConfig
+from cluster.evaluation.run_evaluation import _default_out
+from cluster.reporting.model_card import PROCEDURAL, source_of_run
+from cluster.runs.run_folder import RunFolder, begin, find
+from cluster.runs.warm_start import seen_by
+from collector.objects.catalogue import scan
+from collector.objects.procedural.writing import generate
 from shared.errors import UsageError
 from shared.store import Store
 from shared.store.provenance import changed_versions

@@ -12,19 +12,20 @@ from pathlib import Path
 
 import pytest
 
-from cluster.blame import MAX_FAULTS, MAX_LOSSES, Blame, Failure, JobError
-from cluster.cli import run as adaafford
-from cluster.collection import Collected, collect
-from cluster.fleet import SerialFleet
-from cluster.session import fleets
-from collector.guard import Limits
-from learner.data import load_dataset
+from cluster.cli.main import run as adaafford
+from cluster.collection.driver import Collected, collect
+from cluster.workers.retries import MAX_FAULTS, MAX_LOSSES, Blame, Failure, JobError
+from cluster.workers.session import fleets
+from cluster.workers.worker_group import SerialFleet
+from collector.watchdog import Limits
+from learner.data.dataset import load_dataset
 from shared.errors import StoreError, WorkerError
-from shared.files import process_name
+from shared.io.files import process_name
 from shared.plan import Job, Plan
 from shared.records import RolloutStatus
-from shared.store import Quarantined, Store, compact, reopening, verify
-from shared.underway import Crumb, Underway, summary_of
+from shared.store import Quarantined, Store, compact, verify
+from shared.store.crash_log import Crumb, Underway, summary_of
+from shared.store.maintenance import reopening
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
 from tests.support.misbehaving_worker import MisbehavingWorker
 from tests.support.small_networks import TINY
@@ -276,8 +277,8 @@ def test_a_dead_process_leaves_its_last_words_until_they_are_swept(tmp_path: Pat
     store = new_store(tmp_path)
     script = (
         "import ctypes, pathlib, sys\n"
-        "from collector.guard import Guard, Limits; from shared.files import process_name\n"
-        "from shared.plan import Job; from shared.underway import Underway\n"
+        "from collector.watchdog import Guard, Limits; from shared.io.files import process_name\n"
+        "from shared.plan import Job; from shared.store.crash_log import Underway\n"
         "guard = Guard(Underway(pathlib.Path(sys.argv[1])), Limits())\n"
         "guard.stand(); print(process_name(), flush=True)\n"
         "with guard.job(Job('random-v0', 4, 8)) as under_way: under_way(5); ctypes.string_at(0)"
@@ -342,7 +343,7 @@ def test_a_replayed_rollout_crashes_before_ones_eyes(tmp_path: Path) -> None:
     store = new_store(tmp_path)
     fill(store, {5: "raise"})
     script = (
-        "import ctypes, sys, collector.worker; from cluster.cli import run\n"
+        "import ctypes, sys, collector.worker; from cluster.cli.main import run\n"
         "collector.worker.Worker.execute = lambda self, plan, index, clock: ctypes.string_at(0)\n"
         "sys.exit(run(sys.argv[1:]))"
     )

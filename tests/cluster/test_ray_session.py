@@ -18,11 +18,11 @@ from typing import Any
 import psutil
 import pytest
 
-from cluster import session
-from cluster.commands import bench
-from cluster.session import ray_session
-from shared import private
+from cluster.cli.commands import bench
+from cluster.workers import session
+from cluster.workers.session import ray_session
 from shared.errors import UsageError, WorkerError
+from shared.io import private
 
 ROOT = Path(__file__).parents[2]
 SOME_USER = ["unshare", "--user", "--map-user=54321", "--map-group=54321"]
@@ -309,7 +309,7 @@ def test_where_there_is_little_shared_memory_a_folder_of_the_session_does(
 
 
 def test_folders_of_killed_sessions_go_and_those_of_live_ones_stay(sessions: Path) -> None:
-    program = "from cluster.session import _session_folder as folder\n"
+    program = "from cluster.workers.session import _session_folder as folder\n"
     program += "with folder() as made: print(made, flush=True); input()"
 
     def driver() -> "subprocess.Popen[str]":

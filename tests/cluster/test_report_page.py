@@ -16,30 +16,30 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
-from cluster.cli import run as run_command
-from cluster.configuration import CampaignConfig
-from cluster.episodes import Episode, first_episodes, most_telling
-from cluster.evaluation_tables import ResultRow
-from cluster.ledger import Ledger
+from cluster.cli.main import run as run_command
+from cluster.config.campaign_config import CampaignConfig
+from cluster.evaluation.published import published
+from cluster.evaluation.tables import ResultRow
+from cluster.evaluation.trials import Episode, first_episodes, most_telling
 from cluster.reporting.clouds import TANGENT, CloudView, draw_panels, tried
 from cluster.reporting.collecting import wilson
+from cluster.reporting.counterfactuals import Laboratory, hinge_twins, variations
 from cluster.reporting.failures import FailedExploit, varied
-from cluster.reporting.laboratory import Laboratory, hinge_twins, variations
 from cluster.reporting.page import MAX_TEXT, Drawing, Page, Section, plain, render, shortened
-from cluster.reporting.published import published
 from cluster.reporting.results import Results, table_of
 from cluster.reporting.training import after_tries, curves_of, read_entries
-from cluster.run_folder import ObjectsUsed, RunFolder, begin
-from shared.adaptation import Adapter
-from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
+from cluster.runs.run_folder import ObjectsUsed, RunFolder, begin
+from cluster.runs.run_log import Ledger
+from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import StoreError
-from shared.methods import METHODS
 from shared.plan import EvaluationConfig, Job, ObjectRef, Plan, Setting
-from shared.policy import Policy
+from shared.policies.adaptation import Adapter
+from shared.policies.methods import METHODS
+from shared.policies.policy import Policy
 from shared.records import RolloutRecord
 from shared.store import Store
 from shared.tasks import TASKS, task_named
-from shared.vocabulary import OutcomeKind, Role
+from shared.types import OutcomeKind, Role
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 from tests.support.small_networks import TINY
 from tests.support.small_policies import history_of, observation_of, policy_of

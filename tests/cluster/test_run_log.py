@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cluster.ledger import BEAT_SHARE, Ledger, pause_s
+from cluster.runs.run_log import BEAT_SHARE, Ledger, pause_s
 from tests.support.waiting import wait_until
 
 
@@ -80,7 +80,7 @@ def test_a_torn_log_loses_at_most_its_last_line(tmp_path_factory: pytest.TempPat
 
 
 def test_a_stage_under_way_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cluster.ledger.BEAT_S", 0.01)
+    monkeypatch.setattr("cluster.runs.run_log.BEAT_S", 0.01)
     path, clock = tmp_path / "log.jsonl", FakeClock()
     seen: list[float] = []
 
@@ -126,7 +126,7 @@ def test_a_stage_of_a_year_is_noted_less_than_two_thousand_times() -> None:
 def test_a_log_that_cannot_be_written_for_a_while_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("cluster.ledger.BEAT_S", 0.01)
+    monkeypatch.setattr("cluster.runs.run_log.BEAT_S", 0.01)
     ledger, failed = Ledger(tmp_path / "log.jsonl"), list[str]()
     note = ledger.note
 

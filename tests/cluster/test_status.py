@@ -10,20 +10,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.cli import run
-from cluster.commands.status import as_json, table
-from cluster.ledger import Ledger
-from cluster.logs import JsonLines, Lines, configure
-from cluster.progress import RECENT_S, CollectionProgress
-from cluster.standing import standing_of
-from cluster.status import SILENT_S, DriverStatus, State, read_status, status_kept
-from collector.receipt import Receipt
+from cluster.cli.commands.status import as_json, table
+from cluster.cli.main import run
+from cluster.collection.status_writer import SILENT_S, DriverStatus, State, read_status, status_kept
+from cluster.collection.tally import RECENT_S, CollectionProgress
+from cluster.runs.logs import JsonLines, Lines, configure
+from cluster.runs.run_log import Ledger
+from cluster.runs.status_snapshot import standing_of
+from collector.job_result import Receipt
 from shared.errors import UsageError
-from shared.files import host_name, process_name
+from shared.io.files import host_name, process_name
 from shared.plan import Job, Plan
 from shared.store import Store, verify
+from shared.store.crash_log import Crumb
 from shared.store.provenance import note_machine
-from shared.underway import Crumb
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 from tests.support.waiting import wait_until
 
@@ -202,7 +202,7 @@ def test_the_recent_rate_counts_the_last_half_minute(receipts: list[tuple[float,
 
 
 def test_a_log_line_is_one_json_object_that_names_rollout_and_worker() -> None:
-    record = logging.LogRecord("cluster.blame", logging.WARNING, "f", 1, "job %s\nfailed", ("x",), None)
+    record = logging.LogRecord("cluster.workers.retries", logging.WARNING, "f", 1, "job %s\nfailed", ("x",), None)
     record.rollout, record.worker, record.secret = 17, "host~1~2", "not for the log"
     line = JsonLines().format(record)
     assert "\n" not in line

@@ -17,18 +17,18 @@ from types import FrameType
 import psutil
 import pytest
 
-from cluster.blame import MAX_LOSSES
-from cluster.fleet import Fleet, SerialFleet
-from cluster.orders import PlannedJob
-from cluster.ray_fleet import RayFleet
-from cluster.seats import IN_FLIGHT
-from cluster.session import fleets, ray_session
-from collector.guard import Limits
-from collector.receipt import Receipt
-from shared.configuration import CollectionConfig
+from cluster.workers.job_queue import PlannedJob
+from cluster.workers.ray_group import RayFleet
+from cluster.workers.retries import MAX_LOSSES
+from cluster.workers.session import fleets, ray_session
+from cluster.workers.slots import IN_FLIGHT
+from cluster.workers.worker_group import Fleet, SerialFleet
+from collector.job_result import Receipt
+from collector.watchdog import Limits
+from shared.config import CollectionConfig
 from shared.errors import StoreError, UsageError
 from shared.plan import Job, ObjectRef, Plan, Setting, missing_jobs
-from shared.underway import Underway
+from shared.store.crash_log import Underway
 from tests.support.fake_worker import FakeWorker
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +54,7 @@ def ray_fleet(shared: tuple[Fleet, Path], tmp_path: Path) -> Fleet:
 
 @pytest.fixture(params=["serial", "ray"])
 def fleet(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
-    monkeypatch.setattr("cluster.fleet.WAIT_S", 0.02)
+    monkeypatch.setattr("cluster.workers.worker_group.WAIT_S", 0.02)
     if request.param == "ray":
         found: Fleet = request.getfixturevalue("ray_fleet")
         return found
@@ -209,7 +209,7 @@ def test_a_rollout_that_crashes_costs_itself_alone(
 
 def test_a_rollout_that_hangs_is_ended_with_a_traceback(ray_fleet: Fleet, tmp_path: Path) -> None:
     (tmp_path / "hang-0").write_text("1")
-    with warnings_of("cluster.blame") as lines:
+    with warnings_of("cluster.workers.retries") as lines:
         assert run(ray_fleet, 4) == [job.shard_id for job in jobs(4)]
     assert begun(tmp_path, jobs(4)[0]) == 2
     assert re.search(r"in rollout 0 \(took more than 0:00:02, in _misbehave \(fake_worker.py:\d+\)", lines[0])
@@ -217,7 +217,7 @@ def test_a_rollout_that_hangs_is_ended_with_a_traceback(ray_fleet: Fleet, tmp_pa
 
 def test_memory_that_explodes_is_bounded(ray_fleet: Fleet, tmp_path: Path) -> None:
     (tmp_path / "explode-1").write_text("1")
-    with warnings_of("cluster.blame") as lines:
+    with warnings_of("cluster.workers.retries") as lines:
         assert run(ray_fleet, 3) == [job.shard_id for job in jobs(3)]
     assert "in rollout 1 (MemoryError" in lines[0]
 
@@ -233,7 +233,7 @@ def test_an_actor_that_has_grown_is_replaced_at_no_cost(ray_fleet: Fleet, tmp_pa
 @pytest.mark.slow
 def test_an_actor_that_does_not_even_hear_its_watchdog_is_killed(ray_fleet: Fleet, tmp_path: Path) -> None:
     (tmp_path / "stop-1").write_text("1")
-    with warnings_of("cluster.blame") as lines:
+    with warnings_of("cluster.workers.retries") as lines:
         assert run(ray_fleet, 3) == [job.shard_id for job in jobs(3)]
     assert "took more than 7 s, and had to be killed" in lines[0]
 
@@ -249,7 +249,7 @@ def test_a_rollout_whose_process_is_always_killed_is_quarantined_at_last(ray_fle
 def test_processes_killed_at_random_are_no_rollouts_fault(
     ray_fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cluster.blame.MAX_FAULTS", 1)
+    monkeypatch.setattr("cluster.workers.retries.MAX_FAULTS", 1)
     (tmp_path / "die-1").write_text("2")
     assert run(ray_fleet, 3) == [job.shard_id for job in jobs(3)]
     assert not list(tmp_path.glob("quarantined-*"))

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.cli import run as adaafford
-from cluster.objects import objects_for
-from cluster.selection import ObjectSelection
-from collector import procedural
-from collector.catalogue import Catalogue, for_task, load, load_ref, qualifying_parts, read_list, scan, split
-from collector.preview import contact_sheet, part_colours, picture
+from cluster.cli.main import run as adaafford
+from cluster.config.objects import objects_for
+from cluster.config.selection import ObjectSelection
+from collector.objects import procedural
+from collector.objects.catalogue import Catalogue, for_task, load, load_ref, qualifying_parts, read_list, scan, split
+from collector.viz.preview import contact_sheet, part_colours, picture
 from shared.errors import ObjectError, UsageError
 from shared.plan import ObjectRef
 from shared.store import Store, verify

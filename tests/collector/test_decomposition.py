@@ -11,19 +11,19 @@ from typing import NoReturn
 import numpy as np
 import pytest
 
-from collector import decomposition, meshes
-from collector.articulation import ArticulatedObject, Mesh
-from collector.catalogue import load_ref, scan
-from collector.decomposition import Decomposer
-from collector.pieces import decode, encode
-from collector.procedural import generate
-from collector.scene import Scene
-from shared.configuration import FIDELITIES
+from collector.objects import decomposition, meshes
+from collector.objects.articulation import ArticulatedObject, Mesh
+from collector.objects.catalogue import load_ref, scan
+from collector.objects.decomposition import Decomposer
+from collector.objects.mesh_bytes import decode, encode
+from collector.objects.procedural import generate
+from collector.sim.scene import Scene
+from shared.config import FIDELITIES
 from shared.errors import ObjectError, UsageError
 from shared.geometry import gripper_rotation
+from shared.io.private import cache_folder
 from shared.primitives import PRIMITIVES
-from shared.private import cache_folder
-from shared.vocabulary import HiddenDynamics
+from shared.types import HiddenDynamics
 from tests.support.single_door import drawer
 
 EASY = HiddenDynamics(part_mass=0.2, joint_friction=0.05, surface_friction=1.0)
@@ -189,7 +189,7 @@ def test_without_a_home_decompositions_are_kept_among_temporary_files_of_this_us
         with Decomposer(cache_folder("pieces")) as decomposer:
             assert len(decomposer.pieces(ell())) > 1
         monkeypatch.delenv("TMPDIR")
-        monkeypatch.setattr("shared.private._TEMPORARY", (str(tmp_path / "missing"),))
+        monkeypatch.setattr("shared.io.private._TEMPORARY", (str(tmp_path / "missing"),))
         with pytest.raises(UsageError, match=r"set TMPDIR to a folder .*, or XDG_CACHE_HOME to one for caches"):
             cache_folder("pieces")
 

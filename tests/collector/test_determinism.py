@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collector.catalogue import for_task, scan
-from collector.procedural import generate
+from collector.objects.catalogue import for_task, scan
+from collector.objects.procedural import generate
 from collector.worker import Worker
 from shared.plan import Job, Plan, Setting
 from shared.store import Store
@@ -51,7 +51,7 @@ def collected(path: Path, objects: Path, workers: int, per_shard: int) -> Store:
     """The store of `adaafford collect` in a process of its own."""
     flags = FLAGS | {"objects": objects, "store": path, "workers": workers, "per-shard": per_shard}
     words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
-    program = "import sys; from cluster.cli import main; main()"
+    program = "import sys; from cluster.cli.main import main; main()"
     subprocess.run([sys.executable, "-c", program, "collect", *words], check=True, capture_output=True)
     return Store.open(path)
 

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collector import film
-from collector.articulation import ArticulatedObject
-from collector.film import FIDELITY, FilmedTrial
-from collector.primitives import Trial
-from collector.scene import Scene
+from collector.objects.articulation import ArticulatedObject
+from collector.sim.scene import Scene
+from collector.sim.trial import Trial
+from collector.viz import film
+from collector.viz.film import FIDELITY, FilmedTrial
 from shared.errors import UsageError
 from shared.geometry import gripper_rotation
 from shared.primitives import PRIMITIVES, START_DISTANCE
-from shared.vocabulary import Action, HiddenDynamics
+from shared.types import Action, HiddenDynamics
 from tests.support.single_door import door, drawer
 
 EASY = HiddenDynamics(part_mass=0.2, joint_friction=0.05, surface_friction=1.0)

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collector import bounds, procedural
-from collector.articulation import Body, Joint
-from collector.catalogue import scan
+from collector.objects import bounds, procedural
+from collector.objects.articulation import Body, Joint
+from collector.objects.catalogue import scan
 from shared.errors import ObjectError
 from tests.support.hostile_runs import assert_harmless
 from tests.support.single_door import box

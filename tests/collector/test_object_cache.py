@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from collector.catalogue import scan
-from collector.object_cache import ObjectCache, mesh_bytes
-from collector.procedural import generate
+from collector.objects.cache import ObjectCache, mesh_bytes
+from collector.objects.catalogue import scan
+from collector.objects.procedural import generate
 
 
 @pytest.fixture(scope="module")

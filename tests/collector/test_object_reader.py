@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from collector import meshes, urdf
-from collector.files import ObjectFiles
-from collector.readers import read_object
+from collector.objects import meshes, urdf
+from collector.objects.files import ObjectFiles
+from collector.objects.readers import read_object
 from shared.errors import ObjectError
 
 CUBE_OBJ = (

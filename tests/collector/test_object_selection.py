@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from cluster.cli import run
-from cluster.configuration import CampaignConfig, SplitConfig
-from cluster.objects import lists_of, objects_for, split_as_told
-from cluster.selection import ObjectSelection
-from collector import procedural
+from cluster.cli.main import run
+from cluster.config.campaign_config import CampaignConfig, SplitConfig
+from cluster.config.objects import lists_of, objects_for, split_as_told
+from cluster.config.selection import ObjectSelection
+from collector.objects import procedural
 from shared.categories import TEST_CATEGORIES, TRAIN_CATEGORIES, expanded
 from shared.errors import UsageError
 from shared.plan import ObjectRef

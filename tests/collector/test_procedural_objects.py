@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collector import procedural
-from collector.articulation import ArticulatedObject, Mesh
-from collector.catalogue import qualifying_parts, scan
-from collector.procedural.assembly import GRID, ProceduralObject, normalised
-from collector.procedural.cabinets import storage_furniture
-from collector.procedural.writing import object_files, write_object
-from collector.readers import read_object
+from collector.objects import procedural
+from collector.objects.articulation import ArticulatedObject, Mesh
+from collector.objects.catalogue import qualifying_parts, scan
+from collector.objects.procedural.assembly import GRID, ProceduralObject, normalised
+from collector.objects.procedural.cabinets import storage_furniture
+from collector.objects.procedural.writing import object_files, write_object
+from collector.objects.readers import read_object
 from shared.errors import UsageError
 from shared.tasks import TASKS
 

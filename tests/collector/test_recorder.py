@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from collector.recorder import interact
-from shared.vocabulary import Action, Interaction, Observation, Outcome, OutcomeKind
+from shared.types import Action, Interaction, Observation, Outcome, OutcomeKind
 
 
 class Door:

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cluster.cli import run
-from cluster.resimulation import first_positions, resimulate
-from collector.catalogue import scan
-from collector.procedural import generate
-from collector.scene import restricted_limits
+from cluster.cli.main import run
+from cluster.evaluation.resimulation import first_positions, resimulate
+from collector.objects.catalogue import scan
+from collector.objects.procedural import generate
+from collector.sim.scene import restricted_limits
 from collector.worker import Worker
-from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
+from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.plan import Job, Plan, Setting
 from shared.store import Store
-from shared.vocabulary import Direction
+from shared.types import Direction
 
 CONFIG = CollectionConfig(
     camera=CameraConfig(image_size=128, points=256, candidates=1000),

@@ -6,29 +6,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collector.articulation import ArticulatedObject
-from collector.camera import EmbreeCamera, observation_from
-from collector.catalogue import for_task, load_ref, scan
-from collector.clock import StageClock
-from collector.draws import draw_rollout, object_of
-from collector.environment import draw_state
-from collector.primitives import Trial
-from collector.procedural import generate
-from collector.proposers import LEAST_COSINE, RandomProposer, edge_points, random_rotation
+from collector.domain_randomisation import draw_rollout, object_of
+from collector.objects.articulation import ArticulatedObject
+from collector.objects.catalogue import for_task, load_ref, scan
+from collector.objects.procedural import generate
+from collector.random_proposer import LEAST_COSINE, RandomProposer, edge_points, random_rotation
 from collector.rollout import run_rollout
-from collector.scene import Scene
 from collector.setting import packages_used
+from collector.sim.camera import EmbreeCamera, observation_from
+from collector.sim.environment import draw_state
+from collector.sim.scene import Scene
+from collector.sim.trial import Trial
+from collector.stopwatch import StageClock
 from collector.worker import Worker
-from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
+from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import ObjectError, UsageError
 from shared.geometry import camera_pose
-from shared.methods import METHODS, method_named
 from shared.plan import EvaluationConfig, Job, Plan, Setting
+from shared.policies.methods import METHODS, method_named
 from shared.primitives import PRIMITIVES
 from shared.records import RolloutRecord
 from shared.store import Store
 from shared.tasks import TASKS, task_named
-from shared.vocabulary import Action, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role
+from shared.types import Action, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role
 from tests.support.fake_simulator import FAKE_SIMULATORS, FakeEnvironment
 from tests.support.single_door import door
 

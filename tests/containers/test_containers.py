@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from learner.configuration import AlternationConfig
+from learner.settings import AlternationConfig
 from tests.containers.engine import Engine, Services, engine, wait_for, why_not
 from tests.support.as_toml import as_toml
 from tests.support.small_trainings import FAST

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collector.procedural import generate
+from collector.objects.procedural import generate
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -11,30 +11,30 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cluster.cli import run
-from cluster.commands.collect import CollectCommand
-from cluster.reporting.laboratory import variations
+from cluster.cli.commands.collect import CollectCommand
+from cluster.cli.main import run
+from cluster.config.flags import parse_flags
+from cluster.reporting.counterfactuals import variations
 from cluster.reporting.words import hidden
-from cluster.settings import parse_flags
-from collector.primitives import Trial
-from collector.scene import Scene
-from learner.data import load_dataset
-from learner.facts import FACTS_WIDTH
-from learner.features import FrozenFeatures
-from learner.oracle import Teacher, read_oracle
-from learner.recipes import ORACLE_FILE
-from learner.stages import StageJob, run_stage
-from shared.configuration import FIDELITIES, DynamicsRanges, Range
+from collector.sim.scene import Scene
+from collector.sim.trial import Trial
+from learner.data.dataset import load_dataset
+from learner.data.features import FrozenFeatures
+from learner.data.privileged import FACTS_WIDTH
+from learner.stages.jobs import StageJob, run_stage
+from learner.stages.oracle import Teacher, read_oracle
+from learner.stages.trainers import ORACLE_FILE
+from shared.config import FIDELITIES, DynamicsRanges, Range
 from shared.errors import StoreError, UsageError
 from shared.geometry import gripper_rotation
 from shared.hidden import ALWAYS_DRAWN, HiddenParameter
 from shared.plan import Job, Plan
 from shared.primitives import PRIMITIVES
 from shared.store import Store, compact, export, merge, repair, verify
-from shared.store.columns import ROLLOUT_COLUMNS, added_column
-from shared.store.export import splits_by_share
-from shared.store.tables import read_table
-from shared.vocabulary import Action, HiddenDynamics
+from shared.store.codecs.columns import ROLLOUT_COLUMNS, added_column
+from shared.store.codecs.tables import read_table
+from shared.store.maintenance.export import splits_by_share
+from shared.types import Action, HiddenDynamics
 from tests.store.test_compatibility import add_column, shards_of
 from tests.support.example_package import PACKAGE, install_here
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting

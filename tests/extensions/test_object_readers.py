@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from collector.catalogue import load_ref, scan
-from collector.readers import READERS, read_object
+from collector.objects.catalogue import load_ref, scan
+from collector.objects.readers import READERS, read_object
 from shared.errors import ObjectError
 
 READER = """
 import json
 import numpy as np
-from collector.articulation import Body, Joint
-from collector.meshes import box
-from collector.readers import Description
+from collector.objects.articulation import Body, Joint
+from collector.objects.meshes import box
+from collector.objects.readers import Description
 
 class Lids:
     def matches(self, folder):

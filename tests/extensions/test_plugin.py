@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cluster.cli import run
-from collector.articulation import ArticulatedObject, Body, Joint
-from collector.primitives import Trial
-from collector.scene import Scene
-from shared.configuration import FIDELITIES
+from cluster.cli.main import run
+from collector.objects.articulation import ArticulatedObject, Body, Joint
+from collector.sim.scene import Scene
+from collector.sim.trial import Trial
+from shared.config import FIDELITIES
 from shared.geometry import gripper_rotation
 from shared.primitives import PRIMITIVES, PrimitiveSpec
 from shared.store import Store, verify
-from shared.vocabulary import Action, HiddenDynamics, Outcome
+from shared.types import Action, HiddenDynamics, Outcome
 from tests.support.example_package import PACKAGE, install, install_here
 from tests.support.single_door import base_with, box, drawer
 

@@ -4,23 +4,23 @@ from pathlib import Path
 
 import pytest
 
-from cluster.cli import run
-from learner.configuration import LearnerConfig
-from learner.critics import row_critic
-from learner.data import load_dataset
-from learner.evaluation import evaluate_store
-from learner.features import FrozenFeatures
-from learner.recipes import check_baselines, settings_of
-from learner.stages import StageJob, read_policy_folder, run_stage
-from shared.adaptation import Adapter
-from shared.critics import critic_named
+from cluster.cli.main import run
+from learner.data.dataset import load_dataset
+from learner.data.features import FrozenFeatures
+from learner.evaluation.critics import row_critic
+from learner.evaluation.table import evaluate_store
+from learner.settings import LearnerConfig
+from learner.stages.jobs import StageJob, read_policy_folder, run_stage
+from learner.stages.trainers import check_baselines, settings_of
 from shared.errors import StoreError, UsageError
-from shared.methods import BASELINES
 from shared.plan import Plan, found_by_name
-from shared.policy import Policy
+from shared.policies.adaptation import Adapter
+from shared.policies.critics import critic_named
+from shared.policies.methods import BASELINES
+from shared.policies.policy import Policy
 from shared.store import Store
 from shared.tasks import read_task
-from shared.vocabulary import Interaction
+from shared.types import Interaction
 from tests.learner.test_baselines import as_evaluation
 from tests.support.example_package import PACKAGE, install_here
 from tests.support.small_networks import TINY

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from cluster.cli import run
-from cluster.commands.collect import CollectSettings
-from cluster.configuration import CampaignConfig
-from cluster.settings import layered
-from shared.configuration import parse
+from cluster.cli.commands.collect import CollectSettings
+from cluster.cli.main import run
+from cluster.config.campaign_config import CampaignConfig
+from cluster.config.flags import layered
+from shared.config import parse
 from shared.errors import StoreError, UsageError
 from shared.plan import Setting
 from shared.store import Store

@@ -9,28 +9,28 @@ import pytest
 import torch
 from torch import nn
 
-from learner.configuration import AdaptationConfig, InteractionConfig, LearnerConfig, TrainingConfig
-from learner.critics import OracleScores, row_critic
-from learner.data import Dataset, load_dataset
-from learner.evaluation import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD, evaluate, evaluate_store
-from learner.features import FrozenFeatures
-from learner.frozen import FrozenPrior
-from learner.oracle import OracleCritic, read_oracle
-from learner.prior import PriorStage
-from learner.recipes import ORACLE_FILE
-from learner.stages import StageJob, read_policy_folder, run_stage
-from learner.training import train
-from learner.where2act_adaptation import AdaptationStage
-from learner.where2act_interaction import InteractionStage
-from shared.adaptation import Adapter
-from shared.critics import critic_named
+from learner.data.cached_features import FrozenPrior
+from learner.data.dataset import Dataset, load_dataset
+from learner.data.features import FrozenFeatures
+from learner.evaluation.critics import OracleScores, row_critic
+from learner.evaluation.table import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD, evaluate, evaluate_store
+from learner.settings import AdaptationConfig, InteractionConfig, LearnerConfig, TrainingConfig
+from learner.stages.jobs import StageJob, read_policy_folder, run_stage
+from learner.stages.oracle import OracleCritic, read_oracle
+from learner.stages.prior import PriorStage
+from learner.stages.trainers import ORACLE_FILE
+from learner.stages.where2act_adaptation import AdaptationStage
+from learner.stages.where2act_interaction import InteractionStage
+from learner.training.loop import train
 from shared.errors import StoreError, UsageError
-from shared.methods import METHODS, BaselineName
 from shared.networks.aap import Aap
-from shared.networks.where2act_interaction import TRIES
-from shared.policy import Policy
+from shared.policies.adaptation import Adapter
+from shared.policies.critics import critic_named
+from shared.policies.methods import METHODS, BaselineName
+from shared.policies.policy import Policy
+from shared.policies.where2act_interaction import TRIES
 from shared.records import InteractionRecord, RolloutRecord
-from shared.vocabulary import Interaction, Role
+from shared.types import Interaction, Role
 from tests.support.small_networks import TINY
 from tests.support.small_policies import BASELINES, CRITICS, policy_with_all
 from tests.support.small_trainings import (

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from adaafford.pretrained import load_policy
-from cluster.cli import run
-from cluster.curves import CSV_FILE, FIGURE_FILE, JSON_FILE, MARKDOWN_FILE
+from cluster.cli.main import run
+from cluster.evaluation.curves import CSV_FILE, FIGURE_FILE, JSON_FILE, MARKDOWN_FILE
 from learner.alternation import Finished, alternate, trained_in
-from learner.configuration import AlternationConfig
-from learner.recipes import ORACLE_FILE
-from learner.stages import StageJob, objects_seen, run_stage
+from learner.settings import AlternationConfig
+from learner.stages.jobs import StageJob, objects_seen, run_stage
+from learner.stages.trainers import ORACLE_FILE
 from shared.plan import Plan
 from tests.support.fabricate import fabricate_setting
 from tests.support.small_trainings import FAST, fabricated_rollouts, make_store

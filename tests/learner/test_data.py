@@ -9,11 +9,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.augmentation import draw_turns, turn_facts
-from learner.configuration import AugmentationConfig
-from learner.data import Dataset, load_dataset, split
-from learner.facts import WAY_WIDTH, WAYS_WIDTH, HiddenColumns, facts_of
-from learner.losses import (
+from learner.data.augmentation import draw_turns, turn_facts
+from learner.data.dataset import Dataset, load_dataset, split
+from learner.data.privileged import WAY_WIDTH, WAYS_WIDTH, HiddenColumns, facts_of
+from learner.data.sampling import Batch, order_rows
+from learner.metrics import area_under_roc, best_f_score, calibration_error, discrimination, f_score
+from learner.settings import AugmentationConfig
+from learner.training.losses import (
     action_scoring_loss,
     distillation_loss,
     information_gains,
@@ -21,16 +23,14 @@ from learner.losses import (
     proposal_loss,
     top_score,
 )
-from learner.metrics import area_under_roc, best_f_score, calibration_error, discrimination, f_score
-from learner.sampling import Batch, order_rows
-from shared.configuration import DynamicsRanges
+from shared.config import DynamicsRanges
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
 from shared.hidden import ALWAYS_DRAWN
 from shared.networks.actions import middle_of, orthonormal_frames
 from shared.records import RolloutRecord
 from shared.store.store import Store
-from shared.vocabulary import OutcomeKind
+from shared.types import OutcomeKind
 from tests.support.fabricate import fabricate_setting
 from tests.support.small_networks import TINY
 from tests.support.small_trainings import fabricated_plan, fabricated_rollouts, make_store

@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import nn
 
-from learner import sharing
-from learner.configuration import LearnerConfig, TrainingConfig
-from learner.events import EventFiles
-from learner.hardware import Hardware, choose_device, hardware, moved
-from learner.training import ParameterGroup, StepResult, train
+from learner.settings import LearnerConfig, TrainingConfig
+from learner.training import data_parallel
+from learner.training.events import EventFiles
+from learner.training.hardware import Hardware, choose_device, hardware, moved
+from learner.training.loop import ParameterGroup, StepResult, train
 from shared.errors import UsageError
 
 without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -86,10 +86,10 @@ def test_moving_reaches_every_tensor_and_nothing_else() -> None:
 
 
 def test_one_process_has_the_whole_batch() -> None:
-    assert (sharing.processes(), sharing.rank()) == (1, 0)
-    assert list(range(7))[sharing.share(7)] == list(range(7))
-    assert sharing.shared_mean(torch.tensor(6.0), torch.tensor(4.0)) == 1.5
-    assert sharing.shared_mean(torch.tensor(0.0), torch.tensor(0.0)) == 0.0
+    assert (data_parallel.processes(), data_parallel.rank()) == (1, 0)
+    assert list(range(7))[data_parallel.share(7)] == list(range(7))
+    assert data_parallel.shared_mean(torch.tensor(6.0), torch.tensor(4.0)) == 1.5
+    assert data_parallel.shared_mean(torch.tensor(0.0), torch.tensor(0.0)) == 0.0
 
 
 def test_event_files_are_what_tensorboard_reads(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_event_files_are_what_tensorboard_reads(tmp_path: Path) -> None:
 
 
 def test_without_tensorboard_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learner.events.find_spec", lambda name: None)
+    monkeypatch.setattr("learner.training.events.find_spec", lambda name: None)
     viewer = EventFiles(tmp_path / "events", 0)
     viewer.add(1, {"stage": "line", "score": 1.0})
     assert not (tmp_path / "events").exists()

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cluster.cli import run
+from cluster.cli.main import run
 from learner.alternation import Collect, alternate
-from learner.configuration import PUBLISHED_FILE, AlternationConfig
-from learner.data import kept_for_validation, load_dataset, split
-from learner.following import Following, Pace, publish
-from learner.stages import DONE_FILE, StageJob
+from learner.data.dataset import kept_for_validation, load_dataset, split
+from learner.rounds import Following, Pace, publish
+from learner.settings import PUBLISHED_FILE, AlternationConfig
+from learner.stages.jobs import DONE_FILE, StageJob
 from shared.errors import StoreError
-from shared.files import DRIVER_LOCK, exclusive_lock
+from shared.io.files import DRIVER_LOCK, exclusive_lock
 from shared.plan import Job, Plan
-from shared.policy import POLICY_FILE, WEIGHTS_FILE
+from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 from tests.support.as_toml import as_toml

@@ -20,20 +20,20 @@ from pydantic import TypeAdapter
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from cluster.children import OUTPUT_FILE, Child
-from cluster.cli import INTERRUPTED, run
+from cluster.cli.main import INTERRUPTED, run
+from cluster.runs.subprocesses import OUTPUT_FILE, Child
 from learner.alternation import ALTERNATION_FILE, Finished, alternate, converged
-from learner.configuration import METRICS_FILE, AlternationConfig, LearnerConfig
-from learner.data import load_dataset, split, without_later
-from learner.hardware import Hardware
-from learner.stages import DONE_FILE, LOCK_FILE, StageJob, StageName, as_json, read_policy_folder, run_stage
-from learner.training import CHECKPOINT_FILE
+from learner.data.dataset import load_dataset, split, without_later
+from learner.settings import METRICS_FILE, AlternationConfig, LearnerConfig
+from learner.stages.jobs import DONE_FILE, LOCK_FILE, StageJob, StageName, as_json, read_policy_folder, run_stage
+from learner.training.hardware import Hardware
+from learner.training.loop import CHECKPOINT_FILE
 from shared.errors import UsageError, WorkerError
-from shared.files import exclusive_lock
+from shared.io.files import exclusive_lock
+from shared.io.redaction import without_places
 from shared.plan import Job
-from shared.policy import POLICY_FILE, WEIGHTS_FILE
+from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.progress import Progress
-from shared.redaction import without_places
 from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 from tests.support.as_toml import as_toml
@@ -77,7 +77,7 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 def train_process(arguments: list[str], before: str = "") -> "subprocess.Popen[str]":
-    script = f"import sys\n{before}\nfrom cluster.cli import run\nsys.exit(run(sys.argv[1:]))"
+    script = f"import sys\n{before}\nfrom cluster.cli.main import run\nsys.exit(run(sys.argv[1:]))"
     command = [sys.executable, "-c", script, "train", *arguments]
     return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
@@ -100,13 +100,13 @@ def test_it_trains_without_ray_and_sapien(store: Path, config_file: Path, tmp_pa
 
 
 def train_in(child: Child, job: StageJob) -> None:
-    child.run("learner.stages:run_from_json", as_json(job, EAGER), job.out)
+    child.run("learner.stages.jobs:run_from_json", as_json(job, EAGER), job.out)
 
 
 def learners() -> list[psutil.Process]:
     """This process's children that train; other tests may have left it others."""
     living = [child for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
-    return [child for child in living if "cluster.children" in child.cmdline()]
+    return [child for child in living if "cluster.runs.subprocesses" in child.cmdline()]
 
 
 def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, tmp_path: Path) -> None:

@@ -11,14 +11,17 @@ import pytest
 import torch
 from torch import nn
 
-from cluster.cli import run
-from learner import features, stages
-from learner.aap import AapStage, OracleStage, SeenRows, predict
-from learner.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic
-from learner.aip import AipStage
-from learner.checkpoint import Cursor
-from learner.comparison import curve_rows, rows_of
-from learner.configuration import (
+from cluster.cli.main import run
+from learner.data import features
+from learner.data.cached_features import FrozenAap
+from learner.data.dataset import Dataset, load_dataset
+from learner.data.features import MOST_ENCODERS, FrozenFeatures, ProposalPool, frozen_features
+from learner.data.sampling import Batch, order_rows
+from learner.evaluation.comparison import curve_rows, rows_of
+from learner.evaluation.curve import Answers, Asked, Candidates, answer, proposal_gains, tries_by_aip
+from learner.evaluation.information import tries_by_information
+from learner.evaluation.table import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
+from learner.settings import (
     METRICS_FILE,
     AapConfig,
     AffordanceConfig,
@@ -26,22 +29,20 @@ from learner.configuration import (
     PriorConfig,
     TrainingConfig,
 )
-from learner.curve import Answers, Asked, Candidates, answer, proposal_gains, tries_by_aip
-from learner.data import Dataset, load_dataset
-from learner.evaluation import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
-from learner.features import MOST_ENCODERS, FrozenFeatures, ProposalPool, frozen_features
-from learner.frozen import FrozenAap
-from learner.information import tries_by_information
-from learner.oracle import OracleCritic, Teacher
-from learner.prior import PriorStage
-from learner.sampling import Batch, order_rows
-from learner.stages import DONE_FILE, Memory, StageJob, read_policy_folder, run_stage
-from learner.training import Stage, StepResult, rate_factor, train
+from learner.stages import jobs
+from learner.stages.aap import AapStage, OracleStage, SeenRows, predict
+from learner.stages.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic
+from learner.stages.aip import AipStage
+from learner.stages.jobs import DONE_FILE, Memory, StageJob, read_policy_folder, run_stage
+from learner.stages.oracle import OracleCritic, Teacher
+from learner.stages.prior import PriorStage
+from learner.training.checkpoint import Cursor
+from learner.training.loop import Stage, StepResult, rate_factor, train
 from shared.errors import UsageError
-from shared.networks.configuration import NetworkConfig
-from shared.policy import WEIGHTS_FILE, Policy
+from shared.networks.network_config import NetworkConfig
+from shared.policies.policy import WEIGHTS_FILE, Policy
 from shared.records import InteractionRecord, RolloutRecord
-from shared.vocabulary import Role
+from shared.types import Role
 from tests.support.small_networks import TINY
 from tests.support.small_trainings import (
     EVERYTHING,
@@ -349,7 +350,7 @@ def test_the_best_weights_are_kept_and_patience_ends_a_run(tmp_path: Path) -> No
             self.at_best: torch.Tensor | None = None
 
         def parameter_groups(self) -> list[object]:
-            from learner.training import ParameterGroup
+            from learner.training.loop import ParameterGroup
 
             return [ParameterGroup(tuple(self.module.parameters()))]
 
@@ -406,7 +407,7 @@ def test_stages_of_one_process_make_the_same_and_read_and_encode_once(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loads, encoded, memory = [], [], Memory()
-    monkeypatch.setattr(stages, "load_dataset", lambda *told: loads.append(told) or load_dataset(*told))
+    monkeypatch.setattr(jobs, "load_dataset", lambda *told: loads.append(told) or load_dataset(*told))
     monkeypatch.setattr(features, "frozen_features", lambda *told: encoded.append(told) or frozen_features(*told))
     privileged = FAST.model_copy(update={"aap": FAST.aap.model_copy(update={"training": "privileged"})})
     before: Path | None = None

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from shared.furthest_points import furthest_points
+from shared.policies.furthest_points import furthest_points
 
 
 def assert_furthest(points: NDArray[np.float32], chosen: NDArray[np.int64]) -> None:
@@ -63,7 +63,9 @@ def test_furthest_points_that_are_equally_far_come_in_the_order_of_stored_data(
 
 
 def test_compiled_code_is_kept_in_the_cache_of_the_user_and_nowhere_without_a_home(tmp_path: Path) -> None:
-    script = "import numpy; from shared.furthest_points import furthest_points as f; f(numpy.eye(3, dtype='f4'), 2)"
+    script = (
+        "import numpy; from shared.policies.furthest_points import furthest_points as f; f(numpy.eye(3, dtype='f4'), 2)"
+    )
     here, cache, temporary = tmp_path / "here", tmp_path / "cache", Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))
     here.mkdir()
     base = {name: value for name, value in os.environ.items() if name not in ("HOME", "XDG_CACHE_HOME")}

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from shared.grouping import Grouping, group_cloud, nearest_points
 from shared.networks.aap import Aap
 from shared.networks.actions import MOMENT_SCALE, action_inputs, geodesic_distance, in_gripper, orthonormal_frames
-from shared.networks.configuration import NETWORKS, NetworkConfig
+from shared.networks.grouping import Grouping, group_cloud, nearest_points
 from shared.networks.layers import Head, point_features
+from shared.networks.network_config import NETWORKS, NetworkConfig
 from shared.networks.pointnet2 import CloudBatch, PointNet2, surroundings
 from shared.networks.prior import Prior
 from tests.support.small_networks import TINY

@@ -9,8 +9,8 @@ import torch
 from safetensors.torch import load, save
 
 from shared.errors import StoreError, UsageError
-from shared.networks.configuration import NetworkConfig
-from shared.policy import POLICY_FILE, WEIGHTS_FILE, Policy
+from shared.networks.network_config import NetworkConfig
+from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from tests.support.small_networks import TINY
 
 

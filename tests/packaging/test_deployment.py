@@ -19,7 +19,7 @@ import pytest
 import yaml
 from ray.scripts.scripts import start
 
-from cluster.commands import collect, learn
+from cluster.cli.commands import collect, learn
 from shared.errors import StoreError
 from shared.plan import Job, Plan
 from shared.store import Store, compact, repair, verify

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import shared.extras as extras_module
-from cluster.cli import COMMANDS, NEEDS, run
+from cluster.cli.main import COMMANDS, NEEDS, run
 from shared.extras import EXTRAS, extra_of
 from tests.support.as_toml import as_toml
 from tests.support.small_trainings import FAST, make_store

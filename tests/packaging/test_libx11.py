@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from collector import libx11
+from collector.sim import libx11
 
 WITHOUT_X11 = """
 import ctypes, os, sys
-from collector import libx11
+from collector.sim import libx11
 
 found = ctypes.CDLL
 flags = sys.getdlopenflags()
@@ -50,14 +50,14 @@ def test_an_empty_library_has_no_functions() -> None:
 def test_sapien_simulates_after_an_import_without_x11() -> None:
     script = """
 import ctypes
-from collector import libx11
+from collector.sim import libx11
 
 found = ctypes.CDLL
 # The first question, whether X11 is there, is answered by no; the empty library then takes its place.
 ctypes.CDLL = lambda name, *args, **kwargs: (
     found(name, *args, **kwargs) if name != libx11.NAME else (_ for _ in ()).throw(OSError(name))
 )
-from collector.engine import new_scene
+from collector.sim.engine import new_scene
 
 _, system = new_scene(20)
 system.step()
@@ -68,7 +68,7 @@ print(sum("libX11" in line for line in open("/proc/self/maps")))
 
 
 def test_a_renderer_that_calls_x11_is_refused_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    from collector import sapien_camera
+    from collector.sim import sapien_camera
 
     monkeypatch.setattr(libx11, "is_installed", lambda: False)
     sapien_camera.why_unavailable.cache_clear()

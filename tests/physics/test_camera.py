@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from collector.camera import DepthImage, EmbreeCamera, observation_from
-from shared.configuration import CameraConfig
+from collector.sim.camera import DepthImage, EmbreeCamera, observation_from
+from shared.config import CameraConfig
 from shared.geometry import camera_pose
 from shared.observation import round_normals, round_points
 from tests.support.single_door import door, drawer

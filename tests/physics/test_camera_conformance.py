@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from collector import procedural
-from collector.articulation import ArticulatedObject
-from collector.camera import Camera, DepthImage, EmbreeCamera
-from collector.catalogue import load, scan
-from collector.environment import camera_for
-from collector.sapien_camera import SapienCamera, why_unavailable
-from shared.configuration import CameraConfig
+from collector.objects import procedural
+from collector.objects.articulation import ArticulatedObject
+from collector.objects.catalogue import load, scan
+from collector.sim.camera import Camera, DepthImage, EmbreeCamera
+from collector.sim.environment import camera_for
+from collector.sim.sapien_camera import SapienCamera, why_unavailable
+from shared.config import CameraConfig
 from shared.errors import UsageError
 from shared.geometry import camera_pose
-from shared.vocabulary import Float
+from shared.types import Float
 from tests.support.single_door import door, drawer
 
 CONFIG = CameraConfig(image_size=256)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from collector.articulation import joint_motion
+from collector.objects.articulation import joint_motion
 from shared.geometry import (
     camera_pose,
     gripper_rotation,

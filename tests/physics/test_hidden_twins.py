@@ -7,19 +7,19 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from collector.articulation import ArticulatedObject
-from collector.clock import StageClock
-from collector.environment import SapienEnvironment
-from collector.procedural import build
-from collector.procedural.assembly import ProceduralObject, normalised
-from collector.procedural.cabinets import storage_furniture
-from collector.procedural.writing import write_object
-from collector.proposers import RandomProposer
-from collector.readers import read_object
-from shared.configuration import CameraConfig, CollectionConfig
+from collector.objects.articulation import ArticulatedObject
+from collector.objects.procedural import build
+from collector.objects.procedural.assembly import ProceduralObject, normalised
+from collector.objects.procedural.cabinets import storage_furniture
+from collector.objects.procedural.writing import write_object
+from collector.objects.readers import read_object
+from collector.random_proposer import RandomProposer
+from collector.sim.environment import SapienEnvironment
+from collector.stopwatch import StageClock
+from shared.config import CameraConfig, CollectionConfig
 from shared.geometry import camera_pose, gripper_rotation
 from shared.tasks import Task, task_named
-from shared.vocabulary import Action, Direction, HiddenDynamics, Observation
+from shared.types import Action, Direction, HiddenDynamics, Observation
 
 CAMERA = CameraConfig(image_size=256, points=1024, candidates=8000)
 EASY = HiddenDynamics(part_mass=0.1, joint_friction=0.1, surface_friction=2.0)

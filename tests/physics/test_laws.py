@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collector.articulation import ArticulatedObject
-from collector.primitives import Trial, hand_pose
-from collector.procedural import generate
-from collector.readers import read_object
-from collector.scene import Scene, restricted_limits
-from shared.configuration import FIDELITIES, PUBLISHED_LEG_S
+from collector.objects.articulation import ArticulatedObject
+from collector.objects.procedural import generate
+from collector.objects.readers import read_object
+from collector.sim.scene import Scene, restricted_limits
+from collector.sim.trial import Trial, hand_pose
+from shared.config import FIDELITIES, PUBLISHED_LEG_S
 from shared.geometry import gripper_rotation
 from shared.primitives import PRIMITIVES, PrimitiveSpec, hand_start
-from shared.vocabulary import Action, Direction, HiddenDynamics, Outcome, OutcomeKind
+from shared.types import Action, Direction, HiddenDynamics, Outcome, OutcomeKind
 from tests.support.single_door import door, drawer
 
 FAST = FIDELITIES["fast"]

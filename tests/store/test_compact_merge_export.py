@@ -12,13 +12,13 @@ import pytest
 import zarr
 
 from benchmarks.storing import StoringBenchmark
-from cluster.cli import run
+from cluster.cli.main import run
 from shared.errors import StoreError, UsageError
 from shared.observation import pack_normals
 from shared.plan import Job, Plan
 from shared.store import Store, compact, export, merge, verify
-from shared.store.export import splits_by_share
-from shared.store.observations import ARRAYS
+from shared.store.codecs.observations import ARRAYS
+from shared.store.maintenance.export import splits_by_share
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting, identical
 from tests.support.faults import Fault, disk_faults
 

@@ -14,17 +14,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cluster.cli import run
+from cluster.cli.main import run
 from shared.errors import SchemaVersionError, StoreError, UsageError
 from shared.plan import Job, Plan
 from shared.records import RolloutStatus
-from shared.store import Store, compact, export, info, merge, migrate, migration, repair, verify
-from shared.store.columns import ROLLOUT_COLUMNS, Column
-from shared.store.export import splits_by_share
+from shared.store import Store, compact, export, info, merge, migrate, repair, verify
+from shared.store.codecs.checksummed import seal, unseal
+from shared.store.codecs.columns import ROLLOUT_COLUMNS, Column
+from shared.store.codecs.tables import read_table
 from shared.store.layout import Quarantined
+from shared.store.maintenance import migration
+from shared.store.maintenance.export import splits_by_share
 from shared.store.provenance import changed_versions
-from shared.store.sealed import seal, unseal
-from shared.store.tables import read_table
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "a96b627.tar.xz"

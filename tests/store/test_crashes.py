@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from shared.files import temporary_name
+from shared.io.files import temporary_name
 from shared.plan import Job, Plan, missing_jobs
 from shared.store import Store, verify
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting

@@ -14,17 +14,17 @@ import pyarrow.parquet as pq
 import pytest
 from numcodecs.blosc import Blosc
 
-from learner.data import load_dataset
-from shared.documents import MAX_VALUES, parse_object
+from learner.data.dataset import load_dataset
 from shared.errors import StoreError
-from shared.networks.configuration import NetworkConfig
+from shared.io.documents import MAX_VALUES, parse_object
+from shared.networks.network_config import NetworkConfig
 from shared.plan import Job, Plan
 from shared.store import Store, info, verify
-from shared.store.columns import INTERACTION_COLUMNS, MAX_JOINT_NAMES, MAX_TEXT
-from shared.store.observations import ARRAYS
-from shared.store.repair import repair
-from shared.store.sealed import canonical, seal, unseal
-from shared.store.tables import read_table
+from shared.store.codecs.checksummed import canonical, seal, unseal
+from shared.store.codecs.columns import INTERACTION_COLUMNS, MAX_JOINT_NAMES, MAX_TEXT
+from shared.store.codecs.observations import ARRAYS
+from shared.store.codecs.tables import read_table
+from shared.store.maintenance.repair import repair
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 
 SETTING = fabricate_setting()

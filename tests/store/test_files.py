@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared import files
 from shared.errors import StoreError, UsageError
+from shared.io import files
 from shared.observation import pack_normals, round_normals, round_points, unpack_normals
 
 
@@ -76,7 +76,7 @@ def test_reading_refuses_what_is_no_file(tmp_path: Path) -> None:
 
 def test_a_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
     path = tmp_path / "lock"
-    code = "import sys, time, pathlib; from shared.files import exclusive_lock\n"
+    code = "import sys, time, pathlib; from shared.io.files import exclusive_lock\n"
     code += f"with exclusive_lock(pathlib.Path({str(path)!r})): print('held', flush=True); time.sleep(60)"
     holder = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert holder.stdout is not None
@@ -104,7 +104,7 @@ def test_a_lock_waits_as_long_as_it_is_told(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_only_what_the_dead_left_is_removed(tmp_path: Path) -> None:
-    code = f"from shared.files import temporary_name; import pathlib; (pathlib.Path({str(tmp_path)!r})"
+    code = f"from shared.io.files import temporary_name; import pathlib; (pathlib.Path({str(tmp_path)!r})"
     code += " / temporary_name('shard')).mkdir()"
     subprocess.run([sys.executable, "-c", code], check=True)
     left = next(tmp_path.iterdir())

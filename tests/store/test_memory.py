@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from shared.store import Store, compact, export, info, merge, reader, verify
-from shared.store.export import splits_by_share
+from shared.store.maintenance.export import splits_by_share
 from tests.support.fabricate import fabricate_store
 
 FEW, MANY, AT_ONCE = 4, 20, 4

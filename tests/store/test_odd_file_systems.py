@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from shared import files
 from shared.errors import UsageError
+from shared.io import files
 from shared.plan import Job, Plan
 from shared.store import Store, verify
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
@@ -20,7 +20,7 @@ from tests.support.fabricate import fabricate_rollout, fabricate_setting
 REFUSALS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
 HOLDER = """
 import errno, fcntl, pathlib, sys, time
-from shared import files
+from shared.io import files
 def refuse(*_):
     raise OSError(errno.ENOSYS, "Function not implemented")
 if sys.argv[2] == "no locks":

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from cluster.cli import run
-from learner.data import load_dataset
+from cluster.cli.main import run
+from learner.data.dataset import load_dataset
 from shared.errors import StoreError, UsageError
-from shared.networks.configuration import NetworkConfig
+from shared.networks.network_config import NetworkConfig
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
 from shared.store import Store, check_place, info, verify
-from shared.store.bucket import BucketPlace
-from shared.store.disk import DiskPlace
-from shared.store.place import Place, Publication, place_of
+from shared.store.backends.base import Place, Publication, place_of
+from shared.store.backends.local import DiskPlace
+from shared.store.backends.s3 import BucketPlace
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting, identical
 
 SETTING = fabricate_setting()
@@ -76,7 +76,7 @@ def test_names_from_one_on_come_in_order(place: Place) -> None:
 
 
 def test_more_names_than_one_page_are_listed(s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared.store.bucket.PAGE", 3)
+    monkeypatch.setattr("shared.store.backends.s3.PAGE", 3)
     place = place_of(s3_url)
     for k in range(10):
         place.create(f"shards/{k}", b"")
@@ -235,7 +235,7 @@ def test_what_is_missing_in_a_bucket_is_said_in_one_line(s3_url: str) -> None:
 
 
 def test_a_server_that_fails_is_asked_again(s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared.store.bucket.MAX_RETRIES", 1)
+    monkeypatch.setattr("shared.store.backends.s3.MAX_RETRIES", 1)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     with pytest.raises(StoreError, match=r"check the network and the AWS_\* variables") as caught:
         Store.open(s3_url)

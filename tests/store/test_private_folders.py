@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from shared import private
 from shared.errors import UsageError
-from shared.files import process_name
-from shared.private import private_folder
-from shared.underway import Crumb, Underway
+from shared.io import private
+from shared.io.files import process_name
+from shared.io.private import private_folder
+from shared.store.crash_log import Crumb, Underway
 
 OTHER = 54321
 """A user who is not this one, and need not exist."""

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from cluster.cli import run
-from learner.data import load_dataset
+from cluster.cli.main import run
+from learner.data.dataset import load_dataset
 from shared.errors import AdaAffordError, UnreadableError
-from shared.networks.configuration import NetworkConfig
+from shared.networks.network_config import NetworkConfig
 from shared.plan import Job, Plan
 from shared.store import Store, compact, export, info, merge, repair, verify
-from shared.store.export import splits_by_share
-from shared.store.place import is_url
+from shared.store.backends.base import is_url
+from shared.store.maintenance.export import splits_by_share
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 from tests.support.faults import (
     BUCKET_READ_CALLS,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cluster.cli import run
+from cluster.cli.main import run
 from shared.errors import AdaAffordError, StoreError
 from shared.plan import Plan, missing_jobs
 from shared.store import Store, repair, verify

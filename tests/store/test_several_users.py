@@ -13,19 +13,19 @@ from typing import Any
 
 import pytest
 
-from cluster.cli import run
-from cluster.collection import Newest, collect
-from cluster.status import DriverStatus
-from learner.configuration import PUBLISHED_FILE
-from learner.following import publish
-from shared import files
+from cluster.cli.main import run
+from cluster.collection.driver import Newest, collect
+from cluster.collection.status_writer import DriverStatus
+from learner.rounds import publish
+from learner.settings import PUBLISHED_FILE
 from shared.errors import UsageError
-from shared.files import is_gone, process_name
+from shared.io import files
+from shared.io.files import is_gone, process_name
 from shared.plan import Job, Plan
-from shared.policy import POLICY_FILE, WEIGHTS_FILE
+from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.store import Store, compact, merge, repair, verify
+from shared.store.crash_log import Crumb
 from shared.store.presence import SILENT_S, Mark
-from shared.underway import Crumb
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 
 SETTING = fabricate_setting()
@@ -201,12 +201,12 @@ def test_a_machine_of_the_same_name_sweeps_nothing_that_may_be_alive(tmp_path: P
 AS_USERS = """
 import json, os, sys, tempfile, time
 from pathlib import Path
-import cluster.commands.upkeep, cluster.commands.status, cluster.status, cluster.standing
-from cluster.cli import run
+import cluster.cli.commands.upkeep, cluster.cli.commands.status, cluster.collection.status_writer, cluster.runs.status_snapshot
+from cluster.cli.main import run
 from shared.store import Store, verify, compact, repair
 from tests.store.test_several_users import PLAN, make
 from shared.plan import Job
-from shared.underway import Crumb
+from shared.store.crash_log import Crumb
 from tests.support.fabricate import fabricate_rollouts
 
 def act(where, scratch, user, group, start):

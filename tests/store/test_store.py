@@ -18,16 +18,16 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from shared.configuration import CollectionConfig, Fidelity
+from shared.config import CollectionConfig, Fidelity
 from shared.errors import StoreError, UsageError
 from shared.plan import Job, ObjectRef, Plan
 from shared.records import RolloutRecord
 from shared.store import Store, info, verify
-from shared.store.columns import COPIED_COLUMNS
-from shared.store.digest import rollout_digest
+from shared.store.codecs.checksummed import seal, unseal
+from shared.store.codecs.columns import COPIED_COLUMNS
+from shared.store.codecs.digest import rollout_digest
 from shared.store.layout import parse_shard_id
-from shared.store.sealed import seal, unseal
-from shared.vocabulary import Action, HiddenDynamics, Observation, Outcome, OutcomeKind
+from shared.types import Action, HiddenDynamics, Observation, Outcome, OutcomeKind
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting, identical
 
 SETTING = fabricate_setting()

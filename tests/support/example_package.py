@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from collector.grippers import GRIPPERS
+from collector.sim.grippers import GRIPPERS
 from shared.hidden import HIDDEN_PARAMETERS
-from shared.methods import BASELINES, METHODS, PROPOSERS
+from shared.policies.methods import BASELINES, METHODS, PROPOSERS
 from shared.primitives import PRIMITIVES
-from shared.store.columns import added_column
+from shared.store.codecs.columns import added_column
 from shared.tasks import TASKS
 
 PLUGIN = Path(__file__).parents[2] / "examples" / "plugin"

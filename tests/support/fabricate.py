@@ -13,17 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.configuration import CameraConfig, CollectionConfig, RolloutConfig
+from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.geometry import camera_pose, gripper_rotation
 from shared.observation import round_normals, round_points
 from shared.plan import Job, ObjectRef, Plan, Setting
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store import Store
-from shared.store.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, InteractionRow, RolloutRow
-from shared.store.digest import rollout_digest
-from shared.store.sealed import seal
-from shared.store.tables import table_bytes
-from shared.vocabulary import (
+from shared.store.codecs.checksummed import seal
+from shared.store.codecs.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, InteractionRow, RolloutRow
+from shared.store.codecs.digest import rollout_digest
+from shared.store.codecs.tables import table_bytes
+from shared.types import (
     Action,
     Direction,
     HiddenDynamics,

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from collector.articulation import ArticulatedObject, joint_twist
-from collector.clock import StageClock
-from collector.simulator import PrivilegedState, Simulator
-from shared.configuration import CollectionConfig
+from collector.objects.articulation import ArticulatedObject, joint_twist
+from collector.sim.simulator import PrivilegedState, Simulator
+from collector.stopwatch import StageClock
+from shared.config import CollectionConfig
 from shared.extensions import Registry
 from shared.tasks import Task
-from shared.vocabulary import Action, Float, HiddenDynamics, Observation, Outcome, OutcomeKind
+from shared.types import Action, Float, HiddenDynamics, Observation, Outcome, OutcomeKind
 
 MOTION = 0.1
 """Of the first part, by every action above the middle of the cloud."""

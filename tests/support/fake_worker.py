@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from collector.guard import UnderWay
-from collector.receipt import Receipt
+from collector.job_result import Receipt
+from collector.watchdog import UnderWay
 from shared.errors import StoreError
 from shared.plan import Job, Plan
 

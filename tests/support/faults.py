@@ -16,7 +16,7 @@ from typing import Any
 
 from obstore.exceptions import GenericError, PermissionDeniedError
 
-from shared.store.bucket import BucketPlace
+from shared.store.backends.s3 import BucketPlace
 
 DISK_CALLS = ("open", "write", "fsync", "mkdir", "rename", "link", "unlink", "rmdir")
 BUCKET_CALLS = ("put", "copy", "delete")

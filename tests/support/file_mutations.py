@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numcodecs.blosc import Blosc
 
-from shared.store.sealed import seal
+from shared.store.codecs.checksummed import seal
 from tests.support.mutations import damaged, pick
 
 T = TypeVar("T")

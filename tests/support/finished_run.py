@@ -6,13 +6,13 @@ run = make_finished_run(tmp_path / "run")
 import json
 from pathlib import Path
 
-from cluster.configuration import CampaignConfig
-from cluster.run_folder import ObjectsUsed, RunFolder, begin
-from collector.catalogue import scan
-from collector.procedural.writing import generate
-from shared.networks.configuration import NetworkConfig
+from cluster.config.campaign_config import CampaignConfig
+from cluster.runs.run_folder import ObjectsUsed, RunFolder, begin
+from collector.objects.catalogue import scan
+from collector.objects.procedural.writing import generate
+from shared.networks.network_config import NetworkConfig
 from shared.plan import Setting
-from shared.policy import Policy
+from shared.policies.policy import Policy
 from shared.store import Store
 from shared.tasks import task_named
 

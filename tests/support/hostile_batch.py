@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from collector.camera import EmbreeCamera
-from collector.readers import read_object
-from collector.scene import Scene
-from shared.configuration import FIDELITIES, CameraConfig
+from collector.objects.readers import read_object
+from collector.sim.camera import EmbreeCamera
+from collector.sim.scene import Scene
+from shared.config import FIDELITIES, CameraConfig
 from shared.errors import ObjectError
 from shared.geometry import camera_pose
 from shared.primitives import PRIMITIVES
-from shared.vocabulary import HiddenDynamics
+from shared.types import HiddenDynamics
 from tests.support.mutations import mutate
 
 DYNAMICS = HiddenDynamics(part_mass=0.05, joint_friction=0.05, surface_friction=1.0)

@@ -20,22 +20,22 @@ import torch
 from torch import nn
 
 from adaafford.pretrained import load_policy
-from cluster.configuration import CampaignConfig
-from cluster.ledger import Ledger
-from cluster.run_folder import RunFolder, find
-from cluster.standing import standing_of
+from cluster.config.campaign_config import CampaignConfig
+from cluster.runs.run_folder import RunFolder, find
+from cluster.runs.run_log import Ledger
+from cluster.runs.status_snapshot import standing_of
 from learner.alternation import best_score, trained_in
-from learner.checkpoint import Cursor, read_checkpoint, read_cursor, write_checkpoint
-from learner.data import load_dataset, read_object_list
-from learner.following import _published, _read_snapshot
-from learner.stages import objects_seen
-from shared.configuration import load_toml, parse
+from learner.data.dataset import load_dataset, read_object_list
+from learner.rounds import _published, _read_snapshot
+from learner.stages.jobs import objects_seen
+from learner.training.checkpoint import Cursor, read_checkpoint, read_cursor, write_checkpoint
+from shared.config import load_toml, parse
 from shared.errors import AdaAffordError
-from shared.networks.configuration import NetworkConfig
+from shared.networks.network_config import NetworkConfig
 from shared.plan import Job, Plan
-from shared.policy import Policy
+from shared.policies.policy import Policy
 from shared.store import Store, info, verify
-from shared.store.repair import repair
+from shared.store.maintenance.repair import repair
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 from tests.support.file_mutations import SEALS, mutant_of, pick, remove, replace_by_no_file, vouch
 

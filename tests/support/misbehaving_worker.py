@@ -7,7 +7,7 @@ import signal
 from collections.abc import Mapping
 from pathlib import Path
 
-from collector.clock import StageClock
+from collector.stopwatch import StageClock
 from collector.worker import Worker
 from shared.plan import Plan
 from shared.records import RolloutRecord

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from collector.articulation import ArticulatedObject, Body, Joint, Mesh
+from collector.objects.articulation import ArticulatedObject, Body, Joint, Mesh
 from shared.plan import ObjectRef
-from shared.vocabulary import Float
+from shared.types import Float
 
 _FACES = np.array(
     [

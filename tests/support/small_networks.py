@@ -1,6 +1,6 @@
 """Networks small enough for a test."""
 
-from shared.networks.configuration import NetworkConfig
+from shared.networks.network_config import NetworkConfig
 
 TINY = NetworkConfig(
     centres=(24, 8),

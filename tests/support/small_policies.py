@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from shared.adaptation import movable_points
 from shared.geometry import camera_pose, gripper_rotation
-from shared.methods import BaselineName, CriticName
-from shared.networks.configuration import NetworkConfig
-from shared.policy import Policy
-from shared.vocabulary import Action, Interaction, Observation, Outcome, OutcomeKind
+from shared.networks.network_config import NetworkConfig
+from shared.policies.adaptation import movable_points
+from shared.policies.methods import BaselineName, CriticName
+from shared.policies.policy import Policy
+from shared.types import Action, Interaction, Observation, Outcome, OutcomeKind
 from tests.support.fabricate import fabricate_observation
 from tests.support.small_networks import TINY
 

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from learner.configuration import (
+from learner.data.dataset import Dataset, Split
+from learner.settings import (
     AapConfig,
     AffordanceConfig,
     AipConfig,
     LearnerConfig,
     PriorConfig,
 )
-from learner.data import Dataset, Split
-from learner.training import Stage, StepResult
+from learner.training.loop import Stage, StepResult
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
 from shared.store.store import Store

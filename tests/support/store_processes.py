@@ -13,7 +13,7 @@ from pathlib import Path
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
 from shared.store import Store
-from shared.store.place import is_url
+from shared.store.backends.base import is_url
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 from tests.support.faults import Fault, bucket_faults, disk_faults
 

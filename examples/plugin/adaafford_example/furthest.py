@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from shared.geometry import gripper_rotation
-from shared.methods import ProposerKind
-from shared.vocabulary import Action, Interaction, Observation
+from shared.policies.methods import ProposerKind
+from shared.types import Action, Interaction, Observation
 
 SHARE = 0.1
 """Of the movable points, those furthest away, one of which is tried."""

@@ -1,6 +1,6 @@
 """A task: push the lids of boxes and bins from any state, with heavier lids than elsewhere."""
 
-from shared.configuration import DynamicsRanges, Range
+from shared.config import DynamicsRanges, Range
 from shared.tasks import Task
 
 PUSH_LID = Task(

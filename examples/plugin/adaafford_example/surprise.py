@@ -11,20 +11,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from learner.configuration import TrainingConfig
-from learner.data import Dataset, Split
-from learner.features import FrozenFeatures
-from learner.frozen import FrozenPrior
-from learner.losses import action_scoring_loss
-from learner.recipes import BaselineTraining, Load, Recipe
-from learner.sampling import draw_numbers, order_rows, spread
-from learner.sharing import share
-from learner.training import ParameterGroup, StepResult, TrainingResult
-from shared.adaptation import Adapter, Proposals
-from shared.methods import Baseline, Method
-from shared.networks.configuration import NetworkConfig
-from shared.policy import Policy
-from shared.vocabulary import Action, Float32, Interaction, Observation
+from learner.data.cached_features import FrozenPrior
+from learner.data.dataset import Dataset, Split
+from learner.data.features import FrozenFeatures
+from learner.data.sampling import draw_numbers, order_rows, spread
+from learner.settings import TrainingConfig
+from learner.stages.trainers import BaselineTraining, Load, Recipe
+from learner.training.data_parallel import share
+from learner.training.loop import ParameterGroup, StepResult, TrainingResult
+from learner.training.losses import action_scoring_loss
+from shared.networks.network_config import NetworkConfig
+from shared.policies.adaptation import Adapter, Proposals
+from shared.policies.methods import Baseline, Method
+from shared.policies.policy import Policy
+from shared.types import Action, Float32, Interaction, Observation
 
 NAME = "surprise"
 

@@ -1,7 +1,7 @@
 """A gripper: two flat fingers that open to 140 mm, in the manner of Robotiq's 2F-140, made of boxes."""
 
-from collector.gripper import TIP_DISTANCE, TwoFingers, convex
-from collector.grippers import two_fingered
+from collector.sim.gripper import TIP_DISTANCE, TwoFingers, convex
+from collector.sim.grippers import two_fingered
 
 PALM_END = 0.05
 """From the hand frame's origin to where the fingers begin, m."""

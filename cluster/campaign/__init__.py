@@ -1,0 +1,1 @@
+"""The alternation of collection and training as stages over one folder, and what it will cost."""

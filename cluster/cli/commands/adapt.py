@@ -1,0 +1,114 @@
+"""`adaafford adapt`: affordance that adapts to a real object, for a robot that reads and writes files."""
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from cluster.config.flags import parse_flags
+from shared.errors import AdaAffordError, UsageError
+from shared.io.text import plain
+from shared.types import OutcomeKind
+
+if TYPE_CHECKING:
+    from adaafford.sessions import Session
+
+MAX_LINE_BYTES = 1 << 16
+MIN_SHOWN, MAX_SHOWN = 64, 16384
+"""Of a scan's points, as in the configuration of the simulated camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptCommand:
+    """Say what to try next on a scanned object, and where it can be moved, given what was tried so far.
+
+    Prints one JSON object: what to do ("try" or "act"), and point, approach and forward direction in the scan's frame.
+    Tell what came of it by --outcome, with the next scan, or by writing it into the history. docs/robot.md has the
+    frames and the history's schema.
+    """
+
+    cloud: Path
+    """A scan of the object as it stands (.ply, .npz or .pcd): metres, the object alone."""
+    history: Path
+    """The tries so far (JSON); made where it is not there. Scans lie beside it or below."""
+    policy: str | None = None
+    """A name of those that the package brings, a folder with weights.safetensors and policy.json, or a finished run.
+    Where none is given, the only one that the package brings."""
+    out: Path | None = None
+    """Where the adapted affordance goes: .ply, .npz or .html; heatmap.ply beside the history where none is given."""
+    outcome: float | None = None
+    """How far the part moved in what the last call proposed: rad if it turns, m if it slides, 0 for nothing."""
+    kind: OutcomeKind = OutcomeKind.OK
+    """How that try ended, such as "no-contact" or "no-grasp"."""
+    success: bool | None = None
+    """Whether it moved as intended; where nothing is said, whether it moved by more than 0.01."""
+    up: tuple[float, float, float] | None = None
+    """The direction against gravity in the scan's frame: 0 0 1 where neither this nor the history says. A camera that
+    looks ahead, with x right, y down and z forward, has 0 -1 0."""
+    camera: tuple[float, float, float] | None = None
+    """Where the camera stood in the scan's frame: 0 0 0 where neither this nor the scan nor the history says."""
+    budget: int = 4
+    """How many tries may be proposed before it says how to act."""
+    points: int = 2048
+    """How many points of a scan the policy is shown: as many as it was trained with, which its card says."""
+    seed: int = 0
+    """Of what is drawn."""
+    follow: bool = False
+    """Go on: for each line {"cloud": "scan-2.ply", "outcome": {"motion": 0.2}} on the standard input, print the next
+    step. A step then takes a fraction of a second, since nothing is loaded anew."""
+
+
+def main(args: list[str]) -> int:
+    """Adapt."""
+    command = parse_flags(AdaptCommand, args, "adapt")
+    if command.outcome is None and (command.success is not None or command.kind is not OutcomeKind.OK):
+        raise UsageError("--success and --kind say how an outcome is meant; give --outcome MOTION with them")
+    if command.budget < 1:
+        raise UsageError(f"--budget {command.budget}: at least one try is needed to adapt")
+    if not MIN_SHOWN <= command.points <= MAX_SHOWN:
+        raise UsageError(f"--points {command.points}: allowed are {MIN_SHOWN} to {MAX_SHOWN}")
+    if command.seed < 0:
+        raise UsageError(f"--seed {command.seed}: needs a number that is not negative")
+    from adaafford.histories import TriedOutcome
+    from adaafford.pretrained import load_policy, only_pretrained
+    from adaafford.sessions import Session, SessionFiles
+    from shared.config import parse
+
+    files = SessionFiles(command.history, command.out or command.history.parent / "heatmap.ply")
+    policy = load_policy(command.policy or only_pretrained())
+    session = Session(policy, files, command.budget, command.seed, command.up, command.camera, command.points, _say)
+    told = {"motion": command.outcome, "success": command.success, "kind": command.kind}
+    outcome = None if command.outcome is None else parse(TriedOutcome, told, "--outcome")
+    print(session.step(command.cloud, outcome).model_dump_json(), flush=True)
+    if command.follow:
+        _follow(session, command.cloud.parent)
+    return 0
+
+
+def lines_of(stream: BinaryIO) -> Iterator[bytes]:
+    """Lines as they come; of one that is too long only the first `MAX_LINE_BYTES` are kept."""
+    while line := stream.readline(MAX_LINE_BYTES):
+        rest = line
+        while len(rest) == MAX_LINE_BYTES and not rest.endswith(b"\n"):
+            rest = stream.readline(MAX_LINE_BYTES)
+        yield line
+
+
+def _say(line: str) -> None:
+    print(f"adaafford: {plain(line)}", file=sys.stderr, flush=True)
+
+
+def _follow(session: "Session", folder: Path) -> None:
+    """Answer each line of the standard input by a line; one that cannot be answered, by its reason."""
+    from adaafford.sessions import Request
+
+    for line in lines_of(sys.stdin.buffer):
+        try:
+            if len(line) >= MAX_LINE_BYTES:
+                raise UsageError(f"a line of more than {MAX_LINE_BYTES} bytes; " + 'write {"cloud": "scan.ply"}')
+            request = Request.read(line)
+            print(session.step(folder / request.cloud, request.outcome).model_dump_json(), flush=True)
+        except AdaAffordError as error:
+            print(json.dumps({"error": str(error)}), flush=True)

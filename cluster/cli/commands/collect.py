@@ -1,0 +1,160 @@
+"""`adaafford collect`: collection alone, into one store."""
+
+import logging
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from pydantic import Field
+
+from cluster.config.flags import early_flags, layered, parse_flags
+from cluster.config.selection import ObjectSelection, RayAddress
+from shared.config import CollectionConfig
+from shared.errors import StoreError, UsageError
+from shared.plan import ROLLOUTS_PER_SHARD
+from shared.policies.methods import RANDOM, needs_policy
+
+if TYPE_CHECKING:
+    from shared.plan import ObjectRef
+
+logger = logging.getLogger(__name__)
+
+
+class CollectSettings(ObjectSelection):
+    """What `adaafford collect` may be told by a file as well."""
+
+    task: str = "push"
+    """Which manipulation task: push, pull, pull-closed-door, push-faucet, one that a package adds, or a TOML file."""
+    rollouts: int = Field(100, ge=1)
+    """How many the store shall hold of this plan, those of earlier attempts included; with --policy latest, of this
+    proposer with any policy."""
+    per_version: int | None = Field(None, ge=1)
+    """With --policy latest: rollouts that one version proposes at the most; then the next one is waited for (rounds).
+    Without it, each version proposes until there is a newer one (continuous collection)."""
+    per_shard: int = Field(ROLLOUTS_PER_SHARD, ge=1, le=4096)
+    """Rollouts a shard."""
+    seed: int = Field(1, ge=0, lt=2**63)
+    """Everything random derives from it."""
+    workers: int = Field(2, ge=0, le=4096)
+    """Ray actors, one CPU each; 0 does everything in one process without Ray."""
+    ray_address: RayAddress | None = None
+    """Of a running Ray cluster; a private session on this machine where none is given."""
+    rollout_limit_s: float = Field(300.0, gt=0)
+    """A worker that takes longer for one rollout is taken for hung, and replaced; after three times the rollout is
+    quarantined."""
+    memory_limit_mb: float = Field(2000.0, gt=0)
+    """What a worker may take beyond what it had after its start; at half of that it is replaced after its job."""
+    procedural_per_category: int = Field(8, ge=1, le=10_000)
+    """Built-in objects: how many of each category that the task applies to."""
+    collection: CollectionConfig = CollectionConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class CollectCommand:
+    """Collect interactions into a store. The same command again goes on where it was stopped."""
+
+    settings: Annotated[CollectSettings, tyro.conf.arg(name="")]
+    store: str
+    """Folder or s3:// URL of the store: new, or of the same setting."""
+    proposer: str = RANDOM
+    """Who chooses the interactions: random, aip, or another that the package or an installed one has."""
+    policy: int | Literal["latest"] = 0
+    """Version of the policy in the store that the proposer uses; "random" needs none, "aip" does. "latest": always the
+    newest that is published, also by a learner that is at work at the same time (`adaafford learn --follow`)."""
+    retry_quarantined: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Execute the rollouts again that the store holds as quarantined, once what made them fail was mended."""
+    config: Path | None = None
+    """A TOML file of settings; flags are laid over it."""
+
+
+def main(args: list[str]) -> int:
+    """Collect."""
+    early = early_flags(args, "config")
+    config = Path(early["config"]) if early["config"] else None
+    defaults = CollectCommand(layered(CollectSettings, None, config), tyro.MISSING, config=config)
+    command = parse_flags(CollectCommand, args, "collect", defaults)
+    _ = command.settings.task_record
+    learnt = needs_policy(command.proposer)
+    if learnt != (command.policy == "latest" or command.policy > 0):
+        wanted = "needs --policy VERSION (1 or more, or latest)" if learnt else "takes no --policy"
+        raise UsageError(f"the proposer '{command.proposer}' {wanted}")
+    if command.settings.per_version is not None and command.policy != "latest":
+        raise UsageError("--per-version is about the versions of --policy latest; without that, give --rollouts alone")
+    run_collection(command)
+    return 0
+
+
+def _begun_with(where: str, found: "tuple[ObjectRef, ...]") -> "tuple[ObjectRef, ...]":
+    """The objects that a store was begun with, if all of them are found; a later release may find usable ones more."""
+    from shared.store import Store
+
+    try:
+        known = Store.open(where).setting.objects
+    except StoreError:  # There is none yet, or what is wrong with it is said when it is made.
+        return found
+    if not set(known) < set(found):
+        return found
+    logger.warning(
+        "%s: was begun with %d of the %d objects that can be used; it goes on with these alone",
+        where,
+        len(known),
+        len(found),
+    )
+    return known
+
+
+def run_collection(command: CollectCommand) -> None:
+    """Collect what is left of a command that was checked."""
+    from cluster.collection.driver import Newest, collect
+    from cluster.config.objects import objects_for
+    from cluster.workers.session import fleets
+    from cluster.workers.worker_group import make_worker
+    from collector.setting import make_setting, packages_used
+    from collector.watchdog import Limits
+    from shared.plan import Plan
+    from shared.store import Store
+    from shared.store.backends.base import absolute, folder_beside
+    from shared.store.provenance import changed_versions
+
+    chosen, where = command.settings, absolute(command.store)
+    task = chosen.task_record
+    packages_used(task, chosen.collection)  # Refused before any object is read.
+    catalogue, folder = objects_for(
+        task,
+        chosen,
+        folder_beside(where, "objects"),
+        chosen.procedural_per_category,
+        chosen.seed,
+    )
+    setting = make_setting(
+        task,
+        chosen.collection,
+        seed=chosen.seed,
+        objects=_begun_with(where, tuple(entry.ref for entry in catalogue.usable)),
+    )
+    store = Store.create(where, setting)
+    if changed := changed_versions(store.document.software):
+        print(f"{store.where}: begun with other software: {changed}; what is added may differ by it", file=sys.stderr)
+    plan: Plan | Newest
+    if command.policy == "latest":
+        plan = Newest(command.proposer, chosen.per_version)
+    else:
+        plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
+    limits = Limits(chosen.rollout_limit_s, chosen.memory_limit_mb)
+    with (
+        store.only_driver(alone=command.policy == "latest"),
+        fleets(chosen.workers, limits, chosen.ray_address) as make_fleet,
+    ):
+        open_fleet = partial(make_fleet, partial(make_worker, where, folder), store.underway)
+        collect(
+            store,
+            plan,
+            chosen.rollouts,
+            chosen.per_shard,
+            open_fleet,
+            folder,
+            retry_quarantined=command.retry_quarantined,
+        )

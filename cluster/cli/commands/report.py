@@ -1,0 +1,38 @@
+"""`adaafford report`: a run's results as a page, and on the terminal again."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from cluster.config.flags import parse_flags
+
+
+@dataclass(frozen=True, slots=True)
+class ReportCommand:
+    """Make RUN/report.html, summary.json and affordance.png of a finished run anew, and print its table."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Folder of the run."""
+    experiments: bool = True
+    """Try a test object under other hidden facts in the simulator, and show what the affordance makes of it."""
+
+
+def main(args: list[str]) -> int:
+    """Report."""
+    command = parse_flags(ReportCommand, args, "report")
+    from cluster.reporting.report import print_report, write_report
+    from cluster.runs.run_folder import find
+    from cluster.runs.run_log import Ledger
+
+    run, config = find(command.run)
+    if "evaluate" in Ledger(run.log).finished:
+        write_report(run, config, experiments=command.experiments, say=_say)
+    print_report(run)
+    return 0
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

@@ -1,0 +1,105 @@
+"""`adaafford train`: the learner alone, from a store; needs neither Ray nor SAPIEN."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import tyro
+
+from cluster.config.flags import early_flags, layered, parse_flags
+from learner.settings import LearnerConfig
+from shared.errors import UsageError
+from shared.policies.methods import BASELINES
+
+if TYPE_CHECKING:
+    from learner.stages.jobs import StageJob, StageName
+
+ALTERNATE = "alternate"
+STAGES = ("prior", "aap", "aip", *BASELINES.names(), ALTERNATE)
+USAGE = f"""usage: adaafford train {{{",".join(STAGES)}}} --store STORE --out RUN [--init RUN] [SETTINGS]
+
+  prior      the Where2Act prior, from nothing
+  aap        Adaptive Affordance Prediction; --init names the --out of a prior
+  aip        Adaptive Interaction Proposal; --init names the --out of an aap
+  {", ".join(BASELINES.names())}
+             baselines; the policy keeps what else it holds
+  alternate  prior, aap and aip, and the last two again until validation improves no more
+
+The same command again goes on where it was stopped. `torchrun --nproc-per-node N -m cluster train ...` shares each
+batch among N processes. `adaafford train prior --help` lists all settings."""
+
+
+@dataclass(frozen=True, slots=True)
+class LearnerCommand:
+    """What all commands that train are told."""
+
+    settings: Annotated[LearnerConfig, tyro.conf.arg(name="")]
+    store: str
+    """Folder or s3:// URL of the store."""
+    out: Path
+    """Folder for policies, metrics and checkpoints: new, or of the same training."""
+    train_objects: Path | None = None
+    """A text file with the ids of the objects to learn from, one a line."""
+    validation_objects: Path | None = None
+    """The same, of the objects to judge by; without both, one object in five is kept for that."""
+    config: Path | None = None
+    """A TOML file of settings; flags are laid over it."""
+
+    def job(self, stage: "StageName" = "prior", init: Path | None = None) -> "StageJob":
+        """What is trained on."""
+        from learner.data.dataset import read_object_list
+        from learner.stages.jobs import StageJob
+
+        train, validation = read_object_list(self.train_objects), read_object_list(self.validation_objects)
+        return StageJob(stage, self.store, self.out, init, train, validation)
+
+
+@dataclass(frozen=True, slots=True)
+class TrainCommand(LearnerCommand):
+    """Train networks from a finished store. The same command again goes on where it was stopped."""
+
+    init: Path | None = None
+    """The --out of the stage before, to start from."""
+
+
+Command = TypeVar("Command", bound=LearnerCommand)
+
+
+def parse_learner(command: type[Command], args: list[str], prog: str) -> Command:
+    """Parse the flags of a command that trains, laid over the file that --config names.
+
+    Raises:
+        UsageError: a setting is unknown or not allowed, also one of a package's baseline.
+    """
+    early = early_flags(args, "config")["config"]
+    config = Path(early) if early else None
+    defaults = command(layered(LearnerConfig, None, config), tyro.MISSING, tyro.MISSING, config=config)
+    parsed = parse_flags(command, args, prog, defaults)
+    if parsed.settings.baselines:
+        from learner.stages.trainers import check_baselines
+
+        check_baselines(parsed.settings)
+    return parsed
+
+
+def main(args: list[str]) -> int:
+    """Train."""
+    stage = args[0] if args else "nothing"
+    if stage in ("-h", "--help"):
+        print(USAGE)
+        return 0
+    if stage not in STAGES:
+        given = f"'{stage}'" if args else stage
+        raise UsageError(f"train needs one of {', '.join(STAGES)}; given {given}")
+    command = parse_learner(TrainCommand, args[1:], f"train {stage}")
+    from learner.alternation import Finished, alternate
+    from learner.stages.jobs import run_stage
+    from learner.training.hardware import hardware
+
+    job = command.job("prior" if stage == ALTERNATE else stage, command.init)
+    with hardware(command.settings) as used:
+        if stage == ALTERNATE:
+            alternate(Finished(job), command.settings, used)
+        else:
+            run_stage(job, command.settings, used)
+    return 0

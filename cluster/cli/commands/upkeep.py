@@ -1,0 +1,223 @@
+"""`adaafford store repair|compact|merge|export|migrate`: what makes stores out of stores."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from cluster.config.flags import Action
+from shared.errors import StoreError, UsageError
+from shared.io.text import plain
+from shared.progress import Progress
+
+MOST_SHOWN = 20
+"""Lines of one kind that are printed; --json has all."""
+
+
+@dataclass(frozen=True, slots=True)
+class RepairCommand:
+    """Set aside what is broken, delete nothing, and say what to collect again. Stop all collection first."""
+
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompactCommand:
+    """Make large shards of small ones; the small ones are set aside, the digest stays. Stop all collection first."""
+
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
+    rollouts: int = 256
+    """The most that one shard may hold."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True, slots=True)
+class MergeCommand:
+    """Put what several stores of the same setting hold into one; of a single store, copy it."""
+
+    stores: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Folders or s3:// URLs."""
+    out: str
+    """Folder or s3:// URL of the new store."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportCommand:
+    """Write a store as plain files, one Parquet and one Zarr group a split, with a data card."""
+
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
+    out: Path
+    """A new folder."""
+    test_share: float = 0.0
+    """Share of each category's objects that go into the split "test"; without it there is one split, "train"."""
+    seed: int = 1
+    """Of the draw of test objects."""
+    train_objects: Path | None = None
+    """Instead: a text file with the ids of the objects of the split "train", one a line."""
+    test_objects: Path | None = None
+    """The same for "test"."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True, slots=True)
+class MigrateCommand:
+    """Write a store of an older schema version anew under the current one. The same command again goes on."""
+
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the old store, which stays as it is."""
+    out: str
+    """Folder or s3:// URL of the new store."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+def _writing(execute: Callable[[Any], int]) -> Callable[[Any], int]:
+    """An action that says in one line what the disk refused; nothing is lost by that, and the same command goes on."""
+
+    def run(command: Any) -> int:
+        try:
+            return execute(command)
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            raise StoreError(
+                f"{where}cannot be written ({error.strerror or error}); check space and permissions, then repeat it"
+            ) from None
+
+    return run
+
+
+def _refuse_while_collecting(where: str) -> None:
+    """Refuse a store whose last driver says that it is at work; another machine's lock may not be seen from here.
+
+    Raises:
+        UsageError: it does.
+    """
+    import time
+
+    from cluster.collection.status_writer import SILENT_S, read_status
+    from shared.store.backends.base import place_of
+
+    status = read_status(place_of(where))
+    if status is not None and status.is_alive(time.time()):
+        raise UsageError(
+            f"{where} is in use by process {status.process}, which collects {status.title}; wait for it or stop it "
+            f"(one that was killed is forgotten after {SILENT_S:.0f} s)"
+        )
+
+
+def _repair(command: RepairCommand) -> int:
+    from shared.reproduction import reproduction
+    from shared.store import repair
+
+    _refuse_while_collecting(command.store)
+    with Progress("verifying, shards") as progress:
+        store, done = repair(command.store, progress.show)
+    commands = [reproduction(store.where, job.shard_id, "OBJECTS") for job in done.to_collect]
+    if command.json:
+        jobs = [job.shard_id for job in done.to_collect]
+        print(json.dumps(asdict(done) | {"to_collect": jobs, "commands": commands}, indent=2))
+        return 0
+    for problem in done.problems:
+        print(plain(f"{problem.where}: {problem.what}"))
+    for key in done.set_aside:
+        print(plain(f"set aside      {key}"))
+    for key in done.made_anew:
+        print(plain(f"made anew      {key}"))
+    for version in done.lost_policies:
+        print(f"policy lost    {version}; what it proposed stays, but it cannot propose again")
+    for line in commands[:MOST_SHOWN]:
+        print(f"collect again  {line}")
+    if len(commands) > MOST_SHOWN:
+        print(f"  and {len(commands) - MOST_SHOWN} more; the same `adaafford collect` as before collects all of them")
+    print(f"{len(done.problems)} problems repaired" if done.problems or done.made_anew else "nothing to repair")
+    return 0
+
+
+def _compact(command: CompactCommand) -> int:
+    from shared.store import Store, compact
+
+    store = Store.open(command.store)
+    _refuse_while_collecting(command.store)
+    with Progress("compacting, shards") as progress:
+        done = compact(store, command.rollouts, progress.show)
+    if command.json:
+        print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
+        return 0
+    print(f"{done.before} shards became {done.after}; {len(done.set_aside)} small ones lie in {store.where}/aside")
+    return 0
+
+
+def _merge(command: MergeCommand) -> int:
+    from shared.store import Store, merge
+
+    if not command.stores:
+        raise UsageError("store merge needs one store or more, and --out")
+    _refuse_while_collecting(command.out)
+    with Progress(f"merging into {command.out}, shards") as progress:
+        store, done = merge([Store.open(where) for where in command.stores], command.out, progress.show)
+    if command.json:
+        print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
+        return 0
+    print(f"{done.rollouts} rollouts in {done.shards} shards, {done.in_several} of them in several stores alike")
+    print(f"into {store.where}, digest {store.digest()}")
+    return 0
+
+
+def _export(command: ExportCommand) -> int:
+    from learner.data.dataset import read_object_list
+    from shared.store import Store, export
+    from shared.store.maintenance.export import splits_by_share
+
+    store = Store.open(command.store)
+    lists = {"train": read_object_list(command.train_objects), "test": read_object_list(command.test_objects)}
+    splits = {name: objects for name, objects in lists.items() if objects is not None}
+    if splits and command.test_share:
+        raise UsageError("--test-share and lists of objects exclude each other; give one")
+    with Progress(f"exporting into {command.out}, shards") as progress:
+        done = export(
+            store, command.out, splits or splits_by_share(store, command.test_share, command.seed), progress.show
+        )
+    if command.json:
+        described = {
+            name: asdict(figures) | {"objects": sorted(figures.objects)} for name, figures in done.splits.items()
+        }
+        print(json.dumps({"out": done.out, "splits": described}, indent=2))
+        return 0
+    for name, figures in done.splits.items():
+        print(f"{name:<6} {figures.interactions} interactions of {len(figures.objects)} objects")
+    print(f"into {done.out}; its README.md says what they are")
+    return 0
+
+
+def _migrate(command: MigrateCommand) -> int:
+    from shared.store import migrate
+
+    with Progress(f"migrating into {command.out}, shards") as progress:
+        done = migrate(command.store, command.out, progress.show)
+    if command.json:
+        print(json.dumps(asdict(done), indent=2))
+        return 0
+    print(f"{done.shards} shards of schema version {done.version} written anew, digest {done.digest}")
+    print(f"into {command.out}; {command.store} stays as it is")
+    return 0
+
+
+ACTIONS: dict[str, Action] = {
+    "repair": (RepairCommand, _writing(_repair)),
+    "compact": (CompactCommand, _writing(_compact)),
+    "merge": (MergeCommand, _writing(_merge)),
+    "export": (ExportCommand, _writing(_export)),
+    "migrate": (MigrateCommand, _writing(_migrate)),
+}

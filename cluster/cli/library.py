@@ -1,0 +1,111 @@
+"""What a Python program calls instead of the command line; `adaafford` has these names."""
+
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from shared.config import CollectionConfig, parse
+from shared.errors import UsageError
+from shared.extras import require
+from shared.policies.methods import BASELINES
+from shared.policies.policy import Policy
+from shared.store import Store
+from shared.tasks import task_of
+
+if TYPE_CHECKING:
+    from collector.sim.simulator import SimEnvironment
+    from learner.stages.jobs import StageName
+
+EMPTY_TURNS = 4
+"""Turns over all objects without one that can be acted on, after which there is none."""
+
+
+def collect(store: str | Path, **settings: Any) -> Store:
+    """Collect random interactions into a store until it holds as many rollouts as the settings say.
+
+    Args:
+        store: folder or s3:// URL: new, or of the same settings, to go on with.
+        settings: as the flags of `adaafford collect`: `task`, `objects`, `rollouts`, `workers`, `seed`, and so on; a
+            group of flags, such as `collection`, as a dict.
+
+    Raises:
+        AdaAffordError: as the command; the message says what to do.
+    """
+    from cluster.cli.commands.collect import CollectCommand, CollectSettings, run_collection
+
+    require("adaafford.collect", "collect", without=("ray",))
+    chosen = parse(CollectSettings, settings, "adaafford.collect")
+    _ = chosen.task_record
+    run_collection(CollectCommand(chosen, str(store)))
+    return Store.open(store)
+
+
+def train(
+    stage: "StageName", store: str | Path, out: str | Path, init: str | Path | None = None, **settings: Any
+) -> Policy:
+    """Train one stage from a store alone, or go on with it; returns the policy that it leaves in `out`.
+
+    Args:
+        stage: "prior", "aap", "aip", or a baseline.
+        store: folder or s3:// URL; it is only read.
+        out: folder for the policy, its metrics and checkpoints.
+        init: the `out` of the stage before; every stage but the prior needs one.
+        settings: as the flags of `adaafford train`: `seed`, `device`, and so on; a group, such as `aap`, as a dict.
+
+    Raises:
+        AdaAffordError: as the command; the message says what to do.
+    """
+    from learner.settings import LearnerConfig
+    from learner.stages.jobs import NEEDED, StageJob, run_stage
+    from learner.stages.trainers import check_baselines
+    from learner.training.hardware import hardware
+
+    stages = (*NEEDED, *BASELINES.names())
+    if stage not in stages:
+        raise UsageError(f"unknown stage '{stage}'; allowed: {', '.join(stages)}")
+    config = parse(LearnerConfig, settings, "adaafford.train")
+    check_baselines(config)
+    job = StageJob(stage, store=store, out=Path(out), init=None if init is None else Path(init))
+    with hardware(config) as used:
+        return run_stage(job, config, used)
+
+
+def simulated(objects: str | Path, task: str, seed: int = 1) -> Iterator["SimEnvironment"]:
+    """Simulated objects at rest and in view, one after the other, each with hidden dynamics that are drawn for it.
+
+    Each is an `Environment`, like a robot in front of an object; its `object.ref.id` says which object it is. Every
+    object comes once, in a random order, before any comes again; there is no end.
+
+    Args:
+        objects: a folder of objects in PartNet-Mobility's layout.
+        task: a name or a TOML file, as for `adaafford collect`; objects that it does not apply to are left out.
+        seed: everything random derives from it.
+
+    Raises:
+        UsageError: there is no such task, or no object that it applies to comes to rest in view of the camera.
+    """
+    require("adaafford.simulated", "collect", without=("ray",))
+    from collector.domain_randomisation import draw_rollout, object_of
+    from collector.objects.catalogue import for_task, load_ref, scan
+    from collector.rollout import make_environment
+    from collector.setting import make_setting
+    from collector.stopwatch import StageClock
+    from shared import seeds
+    from shared.plan import Plan
+
+    chosen, folder = task_of(task), Path(objects)
+    refs = tuple(entry.ref for entry in for_task(scan(folder), chosen).usable)
+    if not refs:
+        raise UsageError(f"{folder}: no object that '{task}' applies to; look at `adaafford objects check`")
+    plan = Plan(setting=make_setting(chosen, CollectionConfig(), seed=seed, objects=refs))
+    last = 0
+    for index in count():
+        target = load_ref(folder, object_of(plan, index), plan.setting.collection.collision)
+        environment = make_environment(plan, draw_rollout(plan, index), target, StageClock())
+        states = seeds.generator(seed, f"states/{plan.key}", index, 0)
+        if environment.reset(states) and environment.shows_a_target():
+            last = index
+            yield environment
+        elif index - last >= EMPTY_TURNS * len(refs):
+            raise UsageError(f"{folder}: no object comes to rest in view; look at `adaafford objects check --settle`")

@@ -1,0 +1,173 @@
+"""The command line `adaafford`: finds the subcommand, and turns errors into one line and an exit code.
+
+Heavy packages are imported by the subcommands that need them, so that help is instant.
+"""
+
+import logging
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from importlib import import_module
+from types import TracebackType
+from typing import NoReturn
+
+import adaafford  # noqa: F401 - it sees first that nothing shadows our packages.
+from cluster.runs.logs import configure
+from cluster.runs.streams import Streams
+from shared.errors import AdaAffordError, UsageError
+from shared.extras import extra_of, missing_line, require
+from shared.io.redaction import without_secrets
+from shared.io.text import plain
+
+logger = logging.getLogger(__name__)
+
+SPINS = 30_000
+"""Turns of its loop that a waiting OpenMP thread takes before it sleeps, a tenth of the default: training keeps its
+speed on a quiet machine, and its fair share of a busy one."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as a shell has it."""
+
+COMMANDS = {
+    "run": "collect, train, collect with what was learnt, evaluate: a whole campaign",
+    "resume": "go on with a run that was stopped",
+    "evaluate": "the table of the paper: F-score and sample-success of all methods, on any objects",
+    "compare": "the runs of several seeds as one table, beside the paper's figures",
+    "report": "print a run's results again, and draw its page anew",
+    "adapt": "propose the next try on a scanned object, and say where it can be moved",
+    "export-policy": "a run's policy in half precision with its model card, to take elsewhere",
+    "collect": "collect interactions into a store, without any learning",
+    "train": "prior, aap, aip or alternate: train from a store alone",
+    "curve": "how much trainings find out from stored tries, between Where2Act and an oracle",
+    "status": "how a run or a store stands: rate, done, left, workers",
+    "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
+    "store": "info, verify, digest, replay, repair, compact, merge, export, migrate or check-place: look after stores",
+    "objects": "generate, check, preview or decompose: the objects",
+    "bench": "fidelity, dynamics, collect or learner: measure what helps to choose settings",
+    "version": "print the version",
+}
+"""Subcommands, each a module of `cluster.cli.commands` with `main(args) -> int`."""
+
+NEEDS = {
+    "run": ("collect", "report"),
+    "resume": ("collect", "report"),
+    "evaluate": ("collect",),
+    "compare": ("report",),
+    "report": ("report",),
+    "collect": ("collect",),
+    "curve": ("report",),
+    "objects": ("collect",),
+    "bench": ("collect",),
+}
+"""Extras without which a command would fail, perhaps after hours; what only some of its uses need is not among them."""
+
+RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate")
+"""Long work, which goes on when nobody reads its output any more."""
+
+USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells more\n\n" + "\n".join(
+    f"  {name:<15}{text}" for name, text in COMMANDS.items()
+)
+
+
+def main() -> NoReturn:
+    """Run the command line of this process and exit."""
+    args = sys.argv[1:]
+    streams = begin_process(stop_at_pipe=not args or args[0] not in RESUMABLE)
+    try:
+        code = run(args)
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else _complain(str(stop.code), 1) if stop.code else 0
+    sys.exit(streams.settle(code))
+
+
+def begin_process(*, stop_at_pipe: bool = False) -> Streams:
+    """Set up standard streams, logging and signals of a process of ours; returns the streams.
+
+    Args:
+        stop_at_pipe: see `Streams`.
+    """
+    streams = Streams(stop_at_pipe=stop_at_pipe)
+    configure(os.environ)
+    if "OMP_WAIT_POLICY" not in os.environ:
+        # Read when PyTorch is imported, and inherited by child processes. On a busy machine, a thread that waits in a
+        # loop keeps the processor from the very thread that it waits for.
+        os.environ.setdefault("GOMP_SPINCOUNT", str(SPINS))
+    sys.excepthook = _show_traceback
+    # As Ctrl-C does, so that workers and learners are ended in an orderly way; `nohup` has SIGHUP ignored.
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda received, _: sys.exit(128 + received))
+    return streams
+
+
+def run(args: list[str]) -> int:
+    """Run one command line; returns its exit code."""
+    if not args or args[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0 if args else 2
+    name, rest = args[0], args[1:]
+    if name == "--version":
+        name = "version"
+    if name not in COMMANDS:
+        return _complain(f"unknown command '{name}'; allowed: {', '.join(COMMANDS)}", 2)
+
+    def command() -> int:
+        if not {"-h", "--help"}.intersection(rest):
+            # Ray is needed by several workers alone, and asked for when they start.
+            require(f"adaafford {name}", *NEEDS.get(name, ()), without=("ray",))
+        code: int = import_module(f"cluster.cli.commands.{name.replace('-', '_')}").main(rest)
+        return code
+
+    return guarded(command, args)
+
+
+def guarded(command: Callable[[], int], args: list[str]) -> int:
+    """Run a subcommand; what it raises becomes one line and an exit code.
+
+    Args:
+        command: returns its exit code.
+        args: the command line that it came from.
+    """
+    try:
+        code = command()
+        sys.stdout.flush()
+    except AdaAffordError as error:
+        return _complain(str(error), error.exit_code)
+    except ModuleNotFoundError as error:
+        if extra_of(error.name) is None:
+            raise
+        return _complain(missing_line(f"adaafford {args[0]} here", str(error.name)), UsageError.exit_code)
+    except KeyboardInterrupt:
+        return _interrupted(args)
+    except BrokenPipeError:
+        # Whoever read our output has enough (`adaafford ... | head`).
+        return 128 + signal.SIGPIPE
+    except OSError as error:
+        logger.info("what the system refused", exc_info=True)
+        place = f"{error.filename}: " if error.filename else ""
+        return _complain(f"{place}{error.strerror or error}; see to this and run the same command again", 1)
+    return code
+
+
+def _interrupted(args: list[str]) -> int:
+    """Say how to go on after Ctrl-C."""
+    hint = "; what is committed stays, and the same command goes on" if args[0] in RESUMABLE else ""
+    print(
+        f"adaafford: interrupted{hint}: adaafford {plain(without_secrets(' '.join(args)))}"
+        if hint
+        else "adaafford: interrupted",
+        file=sys.stderr,
+    )
+    return INTERRUPTED
+
+
+def _complain(message: str, code: int) -> int:
+    """Print one line."""
+    print(f"adaafford: {plain(without_secrets(' '.join(message.split())))}", file=sys.stderr)
+    return code
+
+
+def _show_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """As Python shows what is our own mistake, without secrets that its text may quote."""
+    print(without_secrets("".join(traceback.format_exception(kind, error, trace))), end="", file=sys.stderr)

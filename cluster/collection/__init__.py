@@ -1,0 +1,1 @@
+"""Drives a collection, and writes down how it stands."""

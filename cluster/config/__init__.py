@@ -1,0 +1,1 @@
+"""Settings of a run, from defaults, presets, files and flags."""

@@ -1,0 +1,186 @@
+"""From defaults, a preset, a file and flags to one validated model: later ones win, and every setting has a flag."""
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import GenericAlias
+from typing import Any, TypeVar, get_args
+
+import tyro
+from pydantic import BaseModel, ValidationError
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    UnsupportedTypeAnnotationError,
+)
+
+from shared.config import CollectionConfig, DynamicsRanges, Name, load_toml, merge, parse
+from shared.errors import UsageError
+
+PRESETS_FOLDER = Path(__file__).parent / "presets"
+
+Model = TypeVar("Model", bound=BaseModel)
+Command = TypeVar("Command")
+Action = tuple[type[Any], Callable[[Any], int]]
+"""What declares the flags of an action, and what is run with them; returns the exit code."""
+
+FLAG_STYLE = (tyro.conf.AvoidSubcommands, tyro.conf.EnumChoicesFromValues)
+FLAG_TYPES = ConstructorRegistry()
+"""How the values of flags are read where tyro's own way is not ours."""
+
+
+@FLAG_TYPES.primitive_rule
+def _list_with_commas(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Let commas divide numbers and names, as spaces do (`--budgets 1,2,4`); paths may hold commas."""
+    kind, *rest = get_args(info.type) or (None,)
+    if info.type_origin is not tuple or rest != [Ellipsis]:
+        return None
+    as_list: Any = GenericAlias(list, (kind,))
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(as_list, info.markers))
+    if isinstance(spec, UnsupportedTypeAnnotationError):
+        return None
+    numbers = PrimitiveTypeInfo.make(kind, info.markers).type is int
+    if spec.choices is None and not numbers and kind != Name:
+        return None
+    choices = spec.choices
+
+    def read(args: list[str]) -> tuple[Any, ...]:
+        words = [word for arg in args for word in arg.split(",") if word]
+        if wrong := [word for word in words if choices is not None and word not in choices]:
+            raise ValueError(f"invalid choice {wrong[0][:80]!r}; allowed: {', '.join(choices or ())}")
+        return tuple(spec.instance_from_str(words))
+
+    return replace(spec, instance_from_str=read, is_instance=lambda given: isinstance(given, tuple), choices=None)
+
+
+@FLAG_TYPES.primitive_rule
+def _ranges_by_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Let hidden parameters be named with or without a range: `joint_damping,part_mass=0.1:0.5:log`."""
+    if DynamicsRanges not in get_args(info.type):
+        return None
+
+    def read(args: list[str]) -> DynamicsRanges | None:
+        given = {"dynamics": dict(map(_named_range, args[0].split(",")))}
+        return parse(CollectionConfig, given, args[0][:80]).dynamics
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME[=LOW:HIGH[:log]],...",
+        instance_from_str=read,
+        is_instance=lambda given: given is None or isinstance(given, DynamicsRanges),
+        str_from_instance=lambda ranges: ["those of the task" if ranges is None else ", ".join(ranges.root)],
+    )
+
+
+def _named_range(word: str) -> tuple[str, dict[str, Any]]:
+    name, _, interval = word.partition("=")
+    match interval.split(":"):
+        case [""]:
+            return name, {}
+        case [low, high, *rest] if rest in ([], ["log"]):
+            return name, {"low": float(low), "high": float(high), "log": bool(rest)}
+    raise ValueError(f"{word[:80]!r} is no range; write NAME, NAME=LOW:HIGH or NAME=LOW:HIGH:log")
+
+
+def preset_names() -> list[str]:
+    """The presets that the package brings."""
+    return sorted(path.stem for path in PRESETS_FOLDER.glob("*.toml"))
+
+
+def preset(name: str) -> dict[str, Any]:
+    """The settings of a preset.
+
+    Raises:
+        UsageError: there is no such preset; the message lists those there are.
+    """
+    if name not in preset_names():
+        raise UsageError(f"unknown preset '{name}'; allowed: {', '.join(preset_names())}")
+    return load_toml(PRESETS_FOLDER / f"{name}.toml")
+
+
+def layered(model: type[Model], preset_name: str | None, file: Path | None) -> Model:
+    """The model's defaults under a preset under a TOML file; what flags are then laid over.
+
+    Raises:
+        UsageError: the preset or the file is missing, or has a setting that is unknown or not allowed.
+    """
+    values = preset(preset_name) if preset_name else {}
+    if file is None:
+        return parse(model, values, f"preset '{preset_name}'")
+    over = load_toml(file)
+    if "preset" in over:
+        raise UsageError(f"{file}: 'preset' is a flag, not a setting; name it on the command line")
+    return parse(model, merge(values, over), str(file))
+
+
+def early_flags(args: list[str], *names: str) -> dict[str, str | None]:
+    """The values of a few flags that decide the defaults of all others, before those are parsed."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    for name in names:
+        parser.add_argument(f"--{name}")
+    try:
+        known, _ = parser.parse_known_args(args)
+    except argparse.ArgumentError:
+        return dict.fromkeys(names)  # The full parser reports it, with its usage.
+    return vars(known)
+
+
+def parse_flags(
+    command: type[Command],
+    args: list[str],
+    prog: str,
+    default: Command | None = None,
+    *,
+    program: str = "adaafford ",
+) -> Command:
+    """Parse `args` as `command`; a mistake in the flags themselves ends the process with code 2.
+
+    Args:
+        command: declares the flags.
+        args: what was given.
+        prog: the subcommand, for the usage text.
+        default: values of flags that are not given.
+        program: what stands before the subcommand in the usage text.
+
+    Raises:
+        UsageError: a value is of the right type but not allowed.
+    """
+    try:
+        parsed = tyro.cli(
+            command, prog=f"{program}{prog}", args=args, default=default, config=FLAG_STYLE, registry=FLAG_TYPES
+        )
+    except ValidationError as error:
+        problem = error.errors()[0]
+        if isinstance(cause := problem.get("ctx", {}).get("error"), UsageError):
+            raise cause from None
+        name = ".".join(str(part) for part in problem["loc"])
+        raise UsageError(f"flag for '{name}': {problem['msg']}; given {str(problem['input'])[:80]!r}") from None
+    assert parsed is not None
+    return parsed
+
+
+def dispatch(name: str, actions: Mapping[str, Action], args: list[str], operand: str) -> int:
+    """Run the action of a command that its first argument names.
+
+    Args:
+        name: of the command, such as "store".
+        actions: by name: what declares the flags, and what is run with them.
+        args: those of the command.
+        operand: what a usage line shows behind the action.
+
+    Raises:
+        UsageError: there is no such action, or a flag is wrong.
+    """
+    chosen, first = args[:1], next(iter(actions))
+    if chosen in (["-h"], ["--help"]):
+        print(
+            f"usage: adaafford {name} {{{','.join(actions)}}} {operand}; `adaafford {name} {first} --help` tells more"
+        )
+        return 0
+    if not chosen or chosen[0] not in actions:
+        given = f"'{chosen[0]}'" if chosen else "nothing"
+        raise UsageError(f"{name} needs one of {', '.join(actions)}; given {given}")
+    command, execute = actions[chosen[0]]
+    return execute(parse_flags(command, args[1:], f"{name} {chosen[0]}"))

@@ -1,0 +1,1 @@
+"""Evaluation of policies: trials, tables, and the figures of the paper beside them."""

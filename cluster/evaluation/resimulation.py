@@ -1,0 +1,128 @@
+"""Does the store say what happened? Random rows are executed again, each alone in a scene of its own, and compared."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from collector.objects.catalogue import load_ref
+from collector.sim.scene import Scene
+from collector.sim.trial import Trial
+from shared.config import SAPIEN
+from shared.errors import StoreError, UsageError
+from shared.primitives import PRIMITIVES
+from shared.records import InteractionRecord, RolloutRecord
+from shared.seeds import generator
+from shared.store import Store
+from shared.types import Direction, Float, Outcome, OutcomeKind
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """A stored row beside what came of executing it again."""
+
+    shard: str
+    rollout: int
+    step: int
+    stored: Outcome
+    again: Outcome
+
+    @property
+    def same_label(self) -> bool:
+        """Whether both say the same of success."""
+        return self.stored.success is self.again.success
+
+    @property
+    def joint_error(self) -> float:
+        """How far the target joint's end positions are apart, rad or length; NaN where a trial has none."""
+        return abs(self.stored.end_joint_position - self.again.end_joint_position)
+
+
+@dataclass(frozen=True, slots=True)
+class Divergence:
+    """How far rows come out again."""
+
+    rows: tuple[Replayed, ...]
+
+    @property
+    def other_labels(self) -> tuple[Replayed, ...]:
+        """Rows with another label."""
+        return tuple(row for row in self.rows if not row.same_label)
+
+    @property
+    def other_kinds(self) -> int:
+        """How many ended in another way."""
+        return sum(row.stored.kind is not row.again.kind for row in self.rows)
+
+    @property
+    def joint_errors(self) -> Float:
+        """Of all rows where both have an end position."""
+        return np.array([row.joint_error for row in self.rows if math.isfinite(row.joint_error)])
+
+
+def resimulate(
+    store: Store, objects: Path, rows: int, seed: int, advance: Callable[[], None] = lambda: None
+) -> Divergence:
+    """Execute random labels of a store again.
+
+    Args:
+        store: which one.
+        objects: folder of the objects that it was made with.
+        rows: how many; all of them, if there are fewer.
+        seed: of the choice.
+        advance: called after each.
+
+    Raises:
+        StoreError: the store is damaged, or holds no label.
+        ObjectError: an object is missing, or its files are others.
+        UsageError: another simulator made the store.
+    """
+    if (simulator := store.setting.collection.simulator) != SAPIEN:
+        raise UsageError(f"{store.where}: made with the simulator '{simulator}'; only SAPIEN executes rows again")
+    replayed = []
+    for shard, chosen in _chosen(store, rows, seed).items():
+        records = {record.index: record for record in store.read_rollouts(shard)}
+        for rollout, step in chosen:
+            record = records[rollout]
+            row = next(one for one in record.interactions if one.step == step)
+            replayed.append(Replayed(shard, rollout, step, row.outcome, _again(store, objects, record, row)))
+            advance()
+    return Divergence(tuple(replayed))
+
+
+def _chosen(store: Store, rows: int, seed: int) -> dict[str, list[tuple[int, int]]]:
+    """Rollout and step of random labels, by shard."""
+    table = store.interactions(["rollout", "step", "outcome"]).to_pylist()
+    labels = [row for row in table if OutcomeKind(row["outcome"]).is_label]
+    if not labels:
+        raise StoreError(f"{store.where}: holds no interaction that could be executed again")
+    picked = generator(seed, "resimulate").choice(len(labels), min(rows, len(labels)), replace=False)
+    by_shard: dict[str, list[tuple[int, int]]] = {}
+    for row in (labels[k] for k in sorted(picked.tolist())):
+        by_shard.setdefault(row["shard"], []).append((row["rollout"], row["step"]))
+    return by_shard
+
+
+def _again(store: Store, objects: Path, record: RolloutRecord, row: InteractionRecord) -> Outcome:
+    collection = store.setting.collection
+    target = load_ref(objects, record.object, collection.collision)
+    primitive = PRIMITIVES.get(row.primitive)
+    scene = Scene(target, record.dynamics, collection.fidelity, primitive, collection.gripper)
+    if record.dynamics.direction is not Direction.AS_BUILT:
+        scene.restrict(first_positions(row.joint_limits, record.dynamics.direction))
+    scene.put(row.joint_positions)
+    return Trial(scene, row.action, row.target_part, primitive, collection.fidelity).run()
+
+
+def first_positions(limits: Float, direction: Direction) -> Float:
+    """Where the joints stood when their limits were set, from the limits [parts, 2] that came of it."""
+    match direction:
+        case Direction.CLOCKWISE:
+            positions = limits[:, 0]
+        case Direction.COUNTER_CLOCKWISE:
+            positions = limits[:, 1]
+        case _:
+            positions = limits.mean(axis=1)
+    return np.asarray(positions, np.float64)

@@ -1,0 +1,81 @@
+"""Evaluation rollouts as one method lived them: its tries in order, and what it did in the end."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+
+from shared.policies.adaptation import Adapter
+from shared.policies.methods import MethodName
+from shared.records import InteractionRecord, RolloutRecord
+from shared.store import Store
+from shared.types import Interaction, Observation, Role
+
+TOLD: MethodName = "ours-final"
+"""The method whose episodes pictures show."""
+MOST_EPISODES = 60
+"""Looked at for pictures, at the most: each holds all clouds of its rollout, some megabytes."""
+CANDIDATES = 40
+"""Episodes among them that are asked for what their tries changed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """What one method did with one object.
+
+    Attributes:
+        rollout: where it comes from.
+        tries: rows of its tries.
+        exploits: rows of what its adapted affordance chose, one a budget.
+    """
+
+    rollout: RolloutRecord
+    tries: tuple[InteractionRecord, ...]
+    exploits: tuple[InteractionRecord, ...]
+
+    @property
+    def history(self) -> list[Interaction]:
+        """The tries as a proposer is told them."""
+        return [Interaction(self.seen_by(row), row.action, row.outcome) for row in self.tries]
+
+    def seen_by(self, row: InteractionRecord) -> Observation:
+        """The observation that a row's action was chosen on."""
+        return self.rollout.observations[row.observation]
+
+    def before(self, exploit: InteractionRecord) -> list[Interaction]:
+        """The tries that came before an exploit."""
+        return self.history[: exploit.budget]
+
+
+def first_episodes(evaluation: Store, most: int = MOST_EPISODES) -> list[Episode]:
+    """The first episodes of the method that pictures show; raises as `episodes` does."""
+    return list(islice(episodes(evaluation, TOLD), most))
+
+
+def episodes(evaluation: Store, method: MethodName) -> Iterator[Episode]:
+    """The episodes of a method that tried anything, in order.
+
+    Raises:
+        StoreError: a shard is damaged or foreign.
+    """
+    for part in evaluation.parts():
+        for rollout in evaluation.rollouts_of(part):
+            own = [row for row in rollout.interactions if row.method == method]
+            tries = tuple(row for row in own if row.role is Role.CONTEXT)
+            if tries:
+                yield Episode(rollout, tries, tuple(row for row in own if row.role is Role.EXPLOIT))
+
+
+def most_telling(found: list[Episode], adapter: Adapter) -> Episode | None:
+    """The episode whose affordance its tries changed the most; None where there is none."""
+    return max(found[:CANDIDATES], key=lambda episode: _change(episode, adapter), default=None)
+
+
+def _change(episode: Episode, adapter: Adapter) -> float:
+    """How much the tries changed the affordance of movable points; more where a try succeeded."""
+    history = episode.history
+    observation = history[0].observation
+    before, after = adapter.affordance(observation, []), adapter.affordance(observation, history)
+    moved = np.abs(after - before)[observation.movable]
+    return float(moved.mean()) + 0.1 * any(interaction.outcome.success for interaction in history)

@@ -1,0 +1,180 @@
+"""Model cards: what a policy was trained on, how well it does, and what it is not for; Markdown beside its weights."""
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from cluster.evaluation.tables import MARKDOWN_FILE
+from cluster.runs.run_folder import RunFolder
+from cluster.runs.warm_start import seen_by
+from learner.alternation import trained_in
+from learner.stages.jobs import DONE_FILE, objects_seen, read_policy_folder
+from shared.config import CameraConfig
+from shared.errors import UsageError
+from shared.io.files import read_bounded
+from shared.io.text import markdown
+from shared.plan import ObjectRef
+from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
+from shared.store import Store
+from shared.store.provenance import software_versions
+
+CARD_FILE = "README.md"
+MAX_TABLE_BYTES = 1 << 20
+PROCEDURAL = "procedural objects only, made by `adaafford objects generate`"
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a policy comes from, for its card.
+
+    Attributes:
+        policy: the policy.
+        name: what it is called there.
+        store: what it was trained on.
+        objects: how many of the store's objects it saw, and for what.
+        seen: those that it learned from, as far as they are the store's.
+        known: content hashes of all that it learned from or was judged by, also before it was fine-tuned.
+        origin: what kind of objects.
+        results: Markdown; a table, and what it is a table of.
+    """
+
+    policy: Policy
+    name: str
+    store: Store
+    objects: str
+    seen: tuple[ObjectRef, ...]
+    known: frozenset[str]
+    origin: str
+    results: str
+
+
+def source_of_run(run: RunFolder, version: int | None) -> Source:
+    """A campaign's policy.
+
+    Raises:
+        UsageError: the run has published no policy.
+        StoreError: it has none of this version.
+    """
+    store = Store.open(run.store)
+    known = store.policy_versions()
+    if not known:
+        raise UsageError(f"{run.path}: has published no policy yet; finish it with `adaafford resume {run.path}`")
+    chosen = known[-1] if version is None else version
+    used = run.objects_used()
+    table = run.training("evaluate") / MARKDOWN_FILE
+    return Source(
+        policy=Policy.from_files(store.read_policy(chosen)),
+        name=f"policy {chosen}",
+        store=store,
+        objects=f"{len(used.train)} to learn from, {len(used.validation)} to validate, {len(used.test)} to test",
+        seen=used.train,
+        known=seen_by(str(run.path)),
+        origin=PROCEDURAL if run.generates_objects() else "objects of a user's folder",
+        results=_without_title(table) if table.is_file() else "This policy was not evaluated.",
+    )
+
+
+def source_of_training(training: Path, store: Store, results: Path | None, origin: str) -> Source:
+    """The policy of a training from a store (`adaafford train`).
+
+    Args:
+        training: its --out.
+        store: what it was trained on.
+        results: a table of `adaafford curve` or `evaluate`; None: there is none.
+        origin: what the store's objects are.
+
+    Raises:
+        UsageError: the training is not finished, or was of another task.
+        StoreError: what it left is damaged.
+    """
+    folder = trained_in(training)
+    policy, seen = read_policy_folder(folder), objects_seen(folder)
+    if policy.task != store.setting.task:
+        raise UsageError(f"{training}: a policy for '{policy.task}', but the store is of '{store.setting.task}'")
+    refs = tuple(ref for ref in store.setting.objects if ref.content_hash in seen)
+    return Source(
+        policy=policy,
+        name=folder.name,
+        store=store,
+        objects=f"{len(refs)} to learn from and to validate by",
+        seen=refs,
+        known=seen,
+        origin=origin,
+        results="This policy was not evaluated." if results is None else _without_title(results),
+    )
+
+
+def export(source: Source, licence: str) -> dict[str, bytes]:
+    """weights.safetensors in half precision, policy.json, README.md, the card, and done.json, by name.
+
+    The last says what objects the policy has seen, so that whoever fine-tunes it is not tested on them.
+
+    The networks of the baselines stay behind: nobody but an evaluation asks for them.
+    """
+    policy = source.policy.without_baselines()
+    files = policy.to_files(half=True)
+    camera = source.store.setting.collection.camera
+    card = (
+        _head(policy, files, licence),
+        _data(source),
+        f"## Results\n\n{source.results}",
+        _limits(camera),
+        _use(policy),
+    )
+    seen = {"stage": "exported", "objects": sorted(source.known)}
+    return {**files, CARD_FILE: ("\n\n".join(card) + "\n").encode(), DONE_FILE: json.dumps(seen).encode()}
+
+
+def _without_title(table: Path) -> str:
+    """Markdown without its first line, the title."""
+    return "\n".join(read_bounded(table, MAX_TABLE_BYTES).decode(errors="replace").splitlines()[1:]).strip()
+
+
+def _head(policy: Policy, files: dict[str, bytes], licence: str) -> str:
+    parameters = sum(tensor.numel() for tensor in policy.modules().parameters())
+    return f"""# AdaAfford policy: {policy.task}
+
+Where and how a gripper can move one articulated object, from a point cloud, adapted by a few tries: Where2Act prior,
+Adaptive Affordance Prediction and Adaptive Interaction Proposal (Wang et al., ECCV 2022).
+
+| | |
+| --- | --- |
+| task | `{policy.task}` |
+| trained modules | {", ".join(sorted(policy.trained))} |
+| parameters | {parameters:,} |
+| weights | `{WEIGHTS_FILE}`, half precision, {len(files[WEIGHTS_FILE]) / 1e6:.1f} MB; sizes in `{POLICY_FILE}` |
+| licence | {licence} |"""
+
+
+def _data(source: Source) -> str:
+    setting = source.store.setting
+    categories = Counter(ref.category for ref in source.seen)
+    rows = source.store.interactions(["success"]).to_pydict()["success"] if source.store.jobs() else []
+    rate = f"{100 * sum(rows) / len(rows):.1f}% successful" if rows else "none"
+    return f"""## Data
+
+{len(rows):,} interactions ({rate}) in simulation, seed {setting.seed}, fidelity `{setting.collection.fidelity.name}`,
+clouds of {setting.collection.camera.points} points; {source.origin}: {source.objects}
+({", ".join(f"{count} {markdown(name)}" for name, count in sorted(categories.items()))}). Digest of the interactions:
+`{source.store.digest()[:16]}`."""
+
+
+def _limits(camera: CameraConfig) -> str:
+    return f"""## Limits
+
+- Trained in simulation alone: rigid parts, one hinge or slide at a time, a flying Panda hand, noise-free depth.
+- The object stands upright and alone in the cloud, in metres, of about the size that the training objects have (they
+  fit into a ball of radius 1), seen from {camera.elevation_deg.low:g} to {camera.elevation_deg.high:g} deg above.
+- What is called a probability is one on objects like those of training, and on no others.
+- It knows neither reach nor safety: check poses, speeds and forces before an arm moves.
+- Half precision: scores differ from those of the trained weights by less than 0.001."""
+
+
+def _use(policy: Policy) -> str:
+    versions = ", ".join(f"{name} {version}" for name, version in sorted(software_versions().items()))
+    return f"""## Use
+
+`adaafford adapt --policy FOLDER --cloud scan.ply --history history.json`, or in Python
+`Adapter(load_policy("FOLDER"))`; FOLDER is where this file lies, or `{policy.task}` if the package brings it.
+Exported with {versions}."""

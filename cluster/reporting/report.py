@@ -1,0 +1,151 @@
+"""The report of a run: summary.json for programs, a table and a page for people, one picture."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from cluster.config.campaign_config import CampaignConfig
+from cluster.evaluation.tables import RESULTS_FILE
+from cluster.reporting.figures import collection_figures
+from cluster.runs.run_folder import RunFolder, read_json
+from cluster.runs.run_log import Ledger
+from shared.errors import UsageError
+from shared.formatting import terminal_table
+from shared.io.files import write_atomically
+from shared.io.text import plain
+from shared.policies.policy import Policy
+from shared.store import Store
+from shared.store.provenance import software_versions
+
+
+def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, say: Callable[[str], None]) -> None:
+    """Write summary.json, affordance.png and report.html from what the run's stages left.
+
+    Args:
+        run: a run that was evaluated.
+        config: its configuration.
+        experiments: whether to try hidden facts in the simulator for the page.
+        say: is told what is under way.
+    """
+    ledger, store = Ledger(run.log), Store.open(run.store)
+    used = run.objects_used()
+    versions = store.policy_versions()
+    summary = {
+        "task": config.task,
+        "seed": config.seed,
+        "rows": _rows(run),
+        **collection_figures(store),
+        "interactions_per_core_second": _speed(ledger),
+        "policy_versions": [0, *versions],
+        "stage_seconds": {name: round(seconds, 1) for name, seconds in ledger.seconds.items()},
+        "wall_seconds": round(sum(ledger.seconds.values()), 1),
+        "workers": config.workers,
+        "objects": {
+            # The name alone, since results are published; older runs have a whole path.
+            "folder": Path(used.folder).name,
+            **{name: [ref.id for ref in getattr(used, name)] for name in ("train", "validation", "test")},
+            "refused": [{"id": object_id, "reason": reason} for object_id, reason in used.refused],
+        },
+        "store_digest": store.digest(),
+        "software": software_versions(),
+        "earlier_software": _earlier_software(run, ledger),
+    }
+    write_atomically(run.summary, json.dumps(summary, indent=1, allow_nan=False).encode())
+    _draw(run, versions[-1])
+    _write_page(run, config, experiments, say)
+
+
+def print_report(run: RunFolder) -> None:
+    """Print the table of a run that was reported, and where its files are.
+
+    Raises:
+        UsageError: the run has no report yet.
+    """
+    if not run.summary.is_file():
+        raise UsageError(f"{run.path}: has no report yet; finish the run with `adaafford resume {run.path}`")
+    summary = read_json(run.summary)
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
+    console.print(_results_table(summary))
+    console.print(_rates_table(summary))
+    for line in _lines(summary, run):
+        console.print(plain(line), markup=False, soft_wrap=True)
+
+
+def _rows(run: RunFolder) -> list[dict[str, Any]]:
+    rows = read_json(run.training("evaluate") / RESULTS_FILE)["rows"]
+    assert isinstance(rows, list)
+    return rows
+
+
+def _earlier_software(run: RunFolder, ledger: Ledger) -> list[dict[str, str]]:
+    """Other versions that made parts of the run, in the order of their attempts."""
+    known = [run.begun_with(), *ledger.software]
+    return [each for n, each in enumerate(known) if each and each != software_versions() and each not in known[:n]]
+
+
+def _speed(ledger: Ledger) -> float | None:
+    """Stored interactions for each second that a worker worked, over the collection rounds."""
+    tallies = [ledger.result(name)["tally"] for name in ledger.finished if name.startswith("collect-")]
+    interactions = sum(tally["interactions"] for tally in tallies)
+    seconds = sum(tally["seconds"].get("total", 0.0) for tally in tallies)
+    return round(interactions / seconds, 2) if seconds > 0 else None
+
+
+def _draw(run: RunFolder, version: int) -> None:
+    """Draw the picture; matplotlib takes a second to import, so only here."""
+    from cluster.reporting.picture import draw_adaptation
+
+    policy = Policy.from_files(Store.open(run.store).read_policy(version))
+    draw_adaptation(Store.open(run.evaluation), policy, run.picture)
+
+
+def _write_page(run: RunFolder, config: CampaignConfig, experiments: bool, say: Callable[[str], None]) -> None:
+    """Write the page; plotly takes a while to import, so only here."""
+    from cluster.reporting.writing import write_page
+
+    write_page(run, config, experiments=experiments, say=say)
+
+
+def _results_table(summary: dict[str, Any]) -> Table:
+    figures = ("f_score", "sample_success", "start_success", "trials", "best_f", "bce", "auc", "base_rate")
+    names = ("method", "budget", *figures)
+    rows = ([row.get(name) for name in names] for row in summary["rows"])
+    title = f"{summary['task']}: objects not seen in training"
+    return terminal_table(title, [name.replace("_", " ") for name in names], rows)
+
+
+def _rates_table(summary: dict[str, Any]) -> Table:
+    names = ("interactions", "successes", "success_rate")
+    rates = summary["random_success_by_category"].items()
+    rows = ([category, *(rate[name] for name in names)] for category, rate in rates)
+    head = ["category", *(name.replace("_", " ") for name in names)]
+    return terminal_table("random interactions, by category", head, rows)
+
+
+def _lines(summary: dict[str, Any], run: RunFolder) -> list[str]:
+    objects = summary["objects"]
+    stages = ", ".join(f"{name} {seconds:g}" for name, seconds in summary["stage_seconds"].items())
+    motions = ", ".join(
+        f"{bin_['low']:g}+ {bin_['count']}" for bin_ in summary["random_motion_histogram"] if bin_["count"]
+    )
+    outcomes = ", ".join(f"{name} {each['share']:.1%}" for name, each in summary["outcomes"].items())
+    speed = summary["interactions_per_core_second"]
+    return [
+        f"objects       {len(objects['train'])} train, {len(objects['validation'])} validation, "
+        f"{len(objects['test'])} test, {len(objects['refused'])} refused (reasons in {run.objects_file.name})",
+        f"interactions  {summary['interactions']}, {'unknown' if speed is None else speed} a core-second; "
+        f"policy versions {', '.join(map(str, summary['policy_versions']))}",
+        f"outcomes      {outcomes}",
+        f"motions       {motions}",
+        f"seconds       {stages}; in all {summary['wall_seconds']:g}",
+        f"files         {_shown(run.summary)}  {_shown(run.picture)}  {_shown(run.page)}  {_shown(run.store)}",
+    ]
+
+
+def _shown(path: Path) -> str:
+    return str(path) if path.exists() else f"(no {path.name})"

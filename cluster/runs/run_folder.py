@@ -1,0 +1,287 @@
+"""The folder of a run: what lies where, which configuration it belongs to, and what made it.
+
+RUN/
+  config.json            resolved configuration, git commit, package versions; written once
+  places.json            where on this machine lies what is not in the run; leave it out where the run is published
+  objects.json           which objects were split how, and which were refused and why
+  objects/               procedural objects, if no folder of objects was given
+  store/                 the interactions, and the published policies
+  evaluation/            a second store: what was tried on unseen objects
+  training/<stage>/      checkpoints, metrics and output of each training stage
+  log.jsonl              the ledger: stages, times, results
+  summary.json           figures
+  affordance.png         one object before and after each try
+  report.html            all of it to look at, in one file
+
+The folder may be renamed, moved or copied: nothing in it is found by an absolute path. Objects that lie elsewhere are
+known by their content, so that they may move, too (`adaafford resume RUN --objects FOLDER`).
+"""
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cluster.config.campaign_config import EXECUTION_SETTINGS, CampaignConfig
+from shared.config import StrictModel, parse
+from shared.errors import UsageError
+from shared.io.documents import parse_object
+from shared.io.files import create_exclusively, read_bounded, write_atomically
+from shared.plan import ObjectRef
+from shared.store.maintenance.difference import differences
+from shared.store.provenance import software_versions
+
+MAX_DOCUMENT_BYTES = 64 << 20
+PLACE_SETTINGS = ("objects", "object_list", "start_from", "splits.train_list", "splits.test_list", "ray_address")
+"""Settings that say where something is; config.json has their last parts alone, and places.json the rest."""
+
+
+class ObjectsUsed(StrictModel):
+    """objects.json: the objects of a run."""
+
+    folder: str
+    """What the folder is called; `RunFolder.objects_folder` finds it."""
+    train: tuple[ObjectRef, ...]
+    validation: tuple[ObjectRef, ...]
+    test: tuple[ObjectRef, ...]
+    refused: tuple[tuple[str, str], ...]
+    """(id, reason)."""
+
+    @property
+    def all(self) -> tuple[ObjectRef, ...]:
+        """Those of all three parts."""
+        return (*self.train, *self.validation, *self.test)
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """Paths within a run."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        """config.json."""
+        return self.path / "config.json"
+
+    @property
+    def places(self) -> Path:
+        """places.json."""
+        return self.path / "places.json"
+
+    @property
+    def objects_file(self) -> Path:
+        """objects.json."""
+        return self.path / "objects.json"
+
+    @property
+    def generated_objects(self) -> Path:
+        """Procedural objects."""
+        return self.path / "objects"
+
+    @property
+    def store(self) -> Path:
+        """The interactions."""
+        return self.path / "store"
+
+    @property
+    def evaluation(self) -> Path:
+        """The evaluation's interactions."""
+        return self.path / "evaluation"
+
+    @property
+    def log(self) -> Path:
+        """The ledger."""
+        return self.path / "log.jsonl"
+
+    @property
+    def summary(self) -> Path:
+        """summary.json."""
+        return self.path / "summary.json"
+
+    @property
+    def picture(self) -> Path:
+        """affordance.png."""
+        return self.path / "affordance.png"
+
+    @property
+    def oracle(self) -> Path:
+        """The training stage that may have left an oracle."""
+        return self.adopted if self.adopted.is_dir() else self.training("aap-1")
+
+    @property
+    def adopted(self) -> Path:
+        """The policy that the run went on from, if it did (`cluster.runs.warm_start`)."""
+        return self.training("adopted")
+
+    @property
+    def page(self) -> Path:
+        """report.html."""
+        return self.path / "report.html"
+
+    def are_novel(self, tested: Iterable[ObjectRef]) -> bool:
+        """Whether objects are of categories that nothing was trained on; of an adopted policy nobody knows."""
+        used = self.objects_used()
+        learned_from = (ref.category for ref in (*used.train, *used.validation))
+        return not self.adopted.is_dir() and {ref.category for ref in tested}.isdisjoint(learned_from)
+
+    def training(self, stage: str) -> Path:
+        """What a training stage leaves."""
+        return self.trainings / stage
+
+    @property
+    def trainings(self) -> Path:
+        """What all training stages leave."""
+        return self.path / "training"
+
+    @property
+    def evaluations(self) -> Path:
+        """What `adaafford evaluate` leaves, a folder each."""
+        return self.path / "evaluations"
+
+    def objects_folder(self) -> Path:
+        """Where the run's objects lie: in the run, or where its user said last.
+
+        Raises:
+            UsageError: they are not there any more.
+        """
+        named = _read_config(self).get("objects")
+        folder = self.generated_objects.resolve() if named is None else Path(str(named))
+        if not self.objects_file.is_file() or folder.is_dir():
+            return folder
+        if named is None:
+            raise UsageError(f"{folder}: the run's own objects are not there any more; restore the folder from a copy")
+        raise UsageError(
+            f"{folder}: the objects of {self.path} are not there any more; say where they are with "
+            f"`adaafford resume {self.path} --objects FOLDER`"
+        )
+
+    def generates_objects(self) -> bool:
+        """Whether its objects are procedural ones of its own."""
+        return _read_config(self).get("objects") is None
+
+    def begun_with(self) -> dict[str, str]:
+        """Versions of the software that the run was begun with."""
+        known = read_json(self.config).get("software")
+        return {str(name): str(version) for name, version in known.items()} if isinstance(known, dict) else {}
+
+    def objects_used(self) -> ObjectsUsed:
+        """What objects.json says."""
+        return parse(ObjectsUsed, read_json(self.objects_file), str(self.objects_file))
+
+
+def begin(path: Path, config: CampaignConfig) -> RunFolder:
+    """Make the folder of a new run, or find the one that was begun with the same configuration.
+
+    Raises:
+        UsageError: the folder holds another run, or anything else.
+    """
+    run = RunFolder(path)
+    settings = config.model_dump(mode="json")
+    document = {"config": _without_places(settings), "software": software_versions()}
+    if path.exists() and not path.is_dir():
+        raise UsageError(f"{path}: not a folder; name a new one")
+    if not run.config.exists() and path.exists() and any(_foreign(path)):
+        raise UsageError(f"{path}: holds something that is no run; name a new or an empty folder")
+    path.mkdir(parents=True, exist_ok=True)
+    if not run.config.exists():
+        # First, since with config.json a run has begun.
+        _write_places(run, settings)
+    if create_exclusively(run.config, json.dumps(document, indent=2).encode()):
+        return run
+    before, now = (_decisive(each) for each in (_read_config(run), settings))
+    if (changed := next(differences(before, now), None)) is not None:
+        name, was, given = changed
+        moved = f" --objects {config.objects}" if name == "objects" and config.objects else ""
+        raise UsageError(
+            f"{path}: holds another run ('{name}' was {was}, is now {given}); name a new folder, or "
+            f"`adaafford resume {path}{moved}`"
+        )
+    return run
+
+
+def find(path: Path) -> tuple[RunFolder, CampaignConfig]:
+    """The run in `path`, and its configuration.
+
+    Raises:
+        UsageError: there is none.
+    """
+    run = RunFolder(path)
+    if not run.config.is_file():
+        raise UsageError(f"{path}: holds no run (no config.json); start one with `adaafford run --out {path}`")
+    return run, parse(CampaignConfig, _read_config(run), str(run.config))
+
+
+def note_places(run: RunFolder, config: CampaignConfig) -> None:
+    """Take note that what a run needs lies elsewhere now."""
+    _write_places(run, config.model_dump(mode="json"))
+
+
+def _write_places(run: RunFolder, settings: Mapping[str, Any]) -> None:
+    found = {name: _setting(settings, name) for name in PLACE_SETTINGS}
+    places = {name: place for name, place in found.items() if place is not None}
+    if places:
+        write_atomically(run.places, json.dumps(places, indent=1).encode())
+    else:
+        run.places.unlink(missing_ok=True)
+
+
+def _without_places(settings: dict[str, Any]) -> dict[str, Any]:
+    names = {name: _setting(settings, name) for name in PLACE_SETTINGS}
+    # With a dot before it, a path's last part is not taken for one of the names that the package brings.
+    short = {
+        name: f"./{Path(place).name}" if os.sep in place else place
+        for name, place in names.items()
+        if place is not None
+    }
+    return _with_settings(settings, short | {"ray_address": None})
+
+
+def _setting(settings: Mapping[str, Any], name: str) -> str | None:
+    found: Any = settings
+    for part in name.split("."):
+        found = found.get(part) if isinstance(found, Mapping) else None
+    return None if found is None else str(found)
+
+
+def _with_settings(settings: Mapping[str, Any], values: Mapping[str, str | None]) -> dict[str, Any]:
+    """Settings with some of them replaced, each by its name with dots."""
+    told = dict(settings)
+    for name, value in values.items():
+        table, _, key = name.rpartition(".")
+        if table:
+            told[table] = {**(told.get(table) or {}), key: value}
+        else:
+            told[key] = value
+    return told
+
+
+def _foreign(path: Path) -> list[Path]:
+    """What lies in a folder apart from hidden files and places.json, which a killed attempt may have left."""
+    own = RunFolder(path).places
+    return [child for child in path.iterdir() if not child.name.startswith(".") and child != own]
+
+
+def _decisive(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that decide what a run produces; how many workers do it is not one of them."""
+    return {name: value for name, value in config.items() if name not in EXECUTION_SETTINGS}
+
+
+def _read_config(run: RunFolder) -> dict[str, Any]:
+    config = read_json(run.config).get("config")
+    if not isinstance(config, dict):
+        raise UsageError(f"{run.config}: not the configuration of a run; name another folder")
+    # Runs of older software have whole paths in config.json; of a run that was published the places are unknown.
+    places = read_json(run.places) if run.places.is_file() else {}
+    return _with_settings(config, {name: str(place) for name, place in places.items() if name in PLACE_SETTINGS})
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object of the run.
+
+    Raises:
+        StoreError: the file is missing, too large or damaged.
+    """
+    return parse_object(read_bounded(path, MAX_DOCUMENT_BYTES), str(path), unique=True)

@@ -1,0 +1,254 @@
+"""Who is to blame for attempts that failed: jobs are tried again, and rollouts that fail too often are quarantined.
+
+A *fault* is of the rollout's own making: its process crashed or hung, or it raised what no rollout may raise. A *loss*
+is a process that ended without a word: killed from outside, gone with its machine, or taken by the kernel for want of
+memory. Faults are deterministic, so few prove the case; losses happen to whoever is at work, so it takes many on one
+rollout before it is suspected, and workers that are killed at random change nothing in what is collected.
+
+Quarantine is for rollouts, not for an environment in which none can succeed (a missing library, a full disk, a limit
+that is too low). So a rollout is only quarantined once another has succeeded after it failed: until then its job is
+kept back (`Backlog`), and where several rollouts fail alike meanwhile, the collection ends and none of them is stored.
+"""
+
+import logging
+import re
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from cluster.workers.job_queue import Orders, PlannedJob
+from shared.errors import WorkerError
+from shared.io.redaction import without_secrets
+from shared.io.text import plain
+from shared.plan import Job
+
+MAX_FAULTS = 3
+"""Attempts that a rollout may fail by itself: one for its own sake, two against bad luck of a machine."""
+MAX_LOSSES = 10
+"""Processes that may be lost over one rollout."""
+MAX_ALIKE = 3
+"""Different rollouts that fail in the same way, at which the environment is suspected: with no success among them, or
+no more successes than failures in all."""
+
+logger = logging.getLogger(__name__)
+
+
+class JobError(WorkerError):
+    """A job failed as often as it may, and no rollout of it is to blame.
+
+    Attributes:
+        job: the job.
+    """
+
+    def __init__(self, job: Job, message: str) -> None:
+        super().__init__(message)
+        self.job = job
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """An attempt at a job that failed.
+
+    Attributes:
+        reason: one line.
+        rollout: the one under way; None if none was.
+        fault: whether it is of the job's own making.
+    """
+
+    reason: str
+    rollout: int | None
+    fault: bool
+
+    @property
+    def kind(self) -> str:
+        """The reason without what differs between rollouts: numbers, and where in the code it happened."""
+        return re.sub(r"\d+", "#", self.reason.partition(", in ")[0])
+
+    @classmethod
+    def of_exception(cls, error: BaseException, rollout: int | None) -> "Failure":
+        """What a worker raised while a rollout was under way."""
+        return cls(describe(error), None if of_environment(error) else rollout, fault=True)
+
+
+class Blame:
+    """Counts the failures of jobs.
+
+    Args:
+        workers: how many may be lost at the same time through no fault of a job.
+    """
+
+    def __init__(self, workers: int = 1) -> None:
+        self._counts: Counter[tuple[Job, int | None, bool]] = Counter()
+        self._idle_losses = 0
+        self._most_idle_losses = MAX_LOSSES * workers
+        self._quarantined: dict[tuple[str, int], str] = {}
+        """By plan and rollout."""
+        self._alike: Counter[str] = Counter()
+        """Rollouts to quarantine, by kind of failure."""
+        self._since_success: dict[tuple[str, int], str] = {}
+        """Those of them that no success has followed, and their kinds of failure."""
+        self._succeeded = 0
+        """Rollouts that were executed, at least."""
+
+    def quarantined(self, job: Job) -> dict[int, str]:
+        """Rollouts of the job that are not to be executed any more, and why."""
+        if not self._quarantined:
+            return {}
+        keys = ((job.plan_key, rollout) for rollout in range(job.start, job.stop))
+        return {key[1]: self._quarantined[key] for key in keys if key in self._quarantined}
+
+    def acquit(self, job: Job) -> None:
+        """Take note that a job was done, so workers can live and rollouts can succeed."""
+        self._idle_losses = 0
+        self._note_success(job.stop - job.start - len(self.quarantined(job)))
+
+    def _note_success(self, rollouts: int) -> None:
+        if rollouts:
+            self._succeeded += rollouts
+            self._since_success.clear()
+
+    def is_suspended(self, job: Job) -> bool:
+        """Whether a rollout of the job is to be quarantined, and none has succeeded since to make that believable."""
+        return any((job.plan_key, rollout) in self._since_success for rollout in self.quarantined(job))
+
+    def charge_nobody(self, reason: str) -> None:
+        """Count a process that was lost before it was given a job.
+
+        Raises:
+            WorkerError: so many were lost without a job being done meanwhile that none will live.
+        """
+        self._idle_losses += 1
+        logger.warning("a worker was lost before it had a job (%s); trying again", reason, extra={"reason": reason})
+        if self._idle_losses >= self._most_idle_losses:
+            raise WorkerError(f"{self._idle_losses} workers were lost before they had a job; last: {reason}")
+
+    def charge(self, job: Job, failure: Failure) -> None:
+        """Count a failure of `job`, which is tried again: without the culprit if that failed often enough.
+
+        Raises:
+            JobError: it failed as often as it may, and not by one of its rollouts; or different rollouts fail alike.
+        """
+        self._counts[job, failure.rollout, failure.fault] += 1
+        if failure.rollout is not None:
+            # The rollouts of a job are executed in order, so one before the one that failed succeeded.
+            given_up = sum(rollout < failure.rollout for rollout in self.quarantined(job))
+            self._note_success(min(failure.rollout - job.start - given_up, 1))
+        count = self._counts[job, failure.rollout, failure.fault]
+        if failure.rollout is None:
+            self._charge_no_rollout(job, failure, count)
+        elif count >= (MAX_FAULTS if failure.fault else MAX_LOSSES):
+            self._quarantined[job.plan_key, failure.rollout] = f"{failure.reason} ({count} times)"
+            self._alike[failure.kind] += 1
+            self._since_success[job.plan_key, failure.rollout] = failure.kind
+            self._require_environment(job, failure)
+            about = {"shard": job.shard_id, "rollout": failure.rollout, "reason": failure.reason}
+            logger.warning(
+                "rollout %d is to be quarantined: %s, %d times", failure.rollout, failure.reason, count, extra=about
+            )
+            return
+        what = "before its rollouts or after them" if failure.rollout is None else f"in rollout {failure.rollout}"
+        about = {"shard": job.shard_id, "rollout": failure.rollout, "reason": failure.reason}
+        logger.warning("job %s failed %s (%s); trying again", job.shard_id, what, failure.reason, extra=about)
+
+    def _require_environment(self, job: Job, failure: Failure) -> None:
+        in_a_row = list(self._since_success.values()).count(failure.kind)
+        alike = self._alike[failure.kind]
+        if in_a_row >= MAX_ALIKE or alike >= max(MAX_ALIKE, self._succeeded):
+            raise JobError(
+                job,
+                f"{max(in_a_row, MAX_ALIKE)} different rollouts failed in the same way ({failure.reason}), so that "
+                "this machine, a setting or an object is at fault; none of them is stored: mend it and give the same "
+                "command again, with --retry-quarantined if `adaafford store info` lists others",
+            )
+
+    def require_any_success(self, job: Job, *, ever: bool) -> None:
+        """See that a job that is all that is left has a rollout to execute, unless others have succeeded.
+
+        Args:
+            job: that has rollouts to quarantine.
+            ever: whether rollouts have succeeded before this attempt.
+
+        Raises:
+            JobError: nothing ever did.
+        """
+        given_up = self.quarantined(job)
+        if not ever and not self._succeeded and len(given_up) == job.stop - job.start:
+            rollout, reason = next(iter(given_up.items()))
+            raise JobError(
+                job,
+                f"no rollout succeeded, and rollout {rollout} failed again and again: {reason}; nothing was stored: "
+                "mend what it says and give the same command again",
+            )
+
+    def _charge_no_rollout(self, job: Job, failure: Failure, count: int) -> None:
+        if failure.fault and count >= MAX_FAULTS:
+            raise JobError(job, f"job {job.shard_id} failed {count} times; last: {failure.reason}")
+        # Whoever kills workers at random often meets one that is just starting, whichever job that is for.
+        self._idle_losses += not failure.fault
+        if self._idle_losses >= self._most_idle_losses:
+            raise JobError(job, f"job {job.shard_id} failed {self._idle_losses} times; last: {failure.reason}")
+
+
+def of_environment(error: BaseException) -> bool:
+    """Whether a library or a file cannot be had, which is no rollout's fault."""
+    return isinstance(error, OSError | ImportError)
+
+
+class Backlog:
+    """Orders to hand out: those that failed first, then new ones, and last those with a rollout to quarantine.
+
+    Args:
+        orders: the new ones.
+        blame: knows which rollouts are to be quarantined.
+    """
+
+    def __init__(self, orders: Orders, blame: Blame) -> None:
+        self._orders = orders
+        self._blame = blame
+        self._again: deque[PlannedJob] = deque()
+        self._suspended: deque[PlannedJob] = deque()
+
+    def __len__(self) -> int:
+        """How many are to be handed out at once."""
+        return len(self._again)
+
+    @property
+    def ended(self) -> bool:
+        """Whether there will be no more, unless one that is handed out comes back."""
+        return not self._again and not self._suspended and self._orders.ended
+
+    def append(self, order: PlannedJob) -> None:
+        """Add an order to those that are to be handed out at once."""
+        self._again.append(order)
+
+    def put_back(self, orders: Sequence[PlannedJob]) -> None:
+        """Take back orders that failed, in front of the others."""
+        for order in reversed(orders):
+            (self._suspended if self._blame.is_suspended(order.job) else self._again).appendleft(order)
+
+    def take(self, *, idle: bool) -> PlannedJob | None:
+        """The next one; None where there is none, or none yet.
+
+        Args:
+            idle: whether nothing is under way that could still succeed.
+
+        Raises:
+            JobError: all that is left would be quarantined, and no rollout ever succeeded.
+        """
+        return self._again.popleft() if self._again else self.take_new(idle=idle)
+
+    def take_new(self, *, idle: bool) -> PlannedJob | None:
+        """The next one behind those that are to be handed out at once; see `take`."""
+        if self._suspended and not self._blame.is_suspended(self._suspended[0].job):
+            return self._suspended.popleft()
+        order = self._orders.take()
+        if order is None and self._suspended and idle:
+            self._blame.require_any_success(self._suspended[0].job, ever=self._orders.any_done)
+            return self._suspended.popleft()
+        return order
+
+
+def describe(error: BaseException) -> str:
+    """An exception in one line of bounded length."""
+    text = plain(without_secrets(" ".join(str(error).split())), 300)
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -1,0 +1,122 @@
+"""Seats of a fleet: a place for one actor each, what it was given to do, and who wants a job next.
+
+Whatever happens with one job takes the same time however many seats there are: seats are filed by what they want, and
+nothing here goes through all of them.
+"""
+
+import time
+from collections import OrderedDict, deque
+from collections.abc import Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any
+
+from cluster.workers.job_queue import PlannedJob
+from shared.store.crash_log import Crumb, Underway
+
+IN_FLIGHT = 2
+"""Jobs an actor holds: one under way, one that waits so that the actor never idles for the driver's sake."""
+
+
+@dataclass(slots=True, eq=False)
+class Task:
+    """What an actor was asked: to arrive, or to execute an order.
+
+    Attributes:
+        order: None if it is to arrive.
+        answer: its process's name, or the receipt.
+    """
+
+    order: PlannedJob | None
+    answer: "Future[Any]"
+
+
+@dataclass(slots=True, eq=False)
+class Seat:
+    """A place for one actor, and what it was asked, oldest first."""
+
+    actor: Any = None
+    """None: the place is empty."""
+    process: str = ""
+    """By which name its breadcrumbs go; "" until it is up."""
+    tasks: deque[Task] = field(default_factory=deque)
+    busy_since: float = 0.0
+    """When the actor was called, or the oldest task came to the head; `time.monotonic`."""
+    seen: tuple[Crumb | None, float] | None = None
+    """The last breadcrumb that was looked at, and since when it has been the same."""
+    first_mb: float | None = None
+    """What the process held after its first job."""
+    retiring: bool = False
+    """Whether it is only to finish what it has."""
+
+    @property
+    def orders(self) -> list[PlannedJob]:
+        """What it holds, oldest first."""
+        return [task.order for task in self.tasks if task.order is not None]
+
+    def settle(self) -> None:
+        """Strike out the oldest task; the next one comes to the head."""
+        self.tasks.popleft()
+        self.busy_since, self.seen = time.monotonic(), None
+
+    def look(self, underway: Underway) -> tuple[Crumb | None, float]:
+        """The breadcrumb of the rollout under way, and since when it has been seen unchanged."""
+        crumb = underway.crumb_of(self.process)
+        if self.seen is None or self.seen[0] != crumb:
+            self.seen = crumb, time.monotonic()
+        return self.seen
+
+    def vacate(self) -> None:
+        """Forget the actor and all that was about it."""
+        self.actor = self.seen = self.first_mb = None
+        self.process, self.retiring = "", False
+        self.tasks.clear()
+
+
+class Seats:
+    """All seats, filed by what they want; `file` one after each change."""
+
+    def __init__(self, count: int) -> None:
+        self._all = [Seat() for _ in range(count)]
+        # Unlike a plain dict's, its first entry is found at once, however many before that were removed.
+        self._empty = OrderedDict[Seat, None].fromkeys(self._all)
+        self._called = OrderedDict[Seat, None]()
+        self._hungry = tuple(OrderedDict[Seat, None]() for _ in range(IN_FLIGHT))
+        """By how many jobs they hold."""
+        self._next_look = 0
+
+    def __iter__(self) -> Iterator[Seat]:
+        return iter(self._all)
+
+    @property
+    def called(self) -> int:
+        """How many actors are on their way."""
+        return len(self._called)
+
+    @property
+    def empty(self) -> Seat | None:
+        """A seat without an actor."""
+        return next(iter(self._empty), None)
+
+    @property
+    def hungriest(self) -> Seat | None:
+        """A seat that may be given a job; none gets a second one while another has none."""
+        return next((seat for hungry in self._hungry for seat in hungry), None)
+
+    def file(self, seat: Seat) -> None:
+        """Take note of what a seat wants now."""
+        for drawer in (self._empty, self._called, *self._hungry):
+            drawer.pop(seat, None)
+        if seat.actor is None:
+            self._empty[seat] = None
+        elif not seat.process:
+            self._called[seat] = None
+        elif not seat.retiring and len(seat.tasks) < IN_FLIGHT:
+            self._hungry[len(seat.tasks)][seat] = None
+
+    def in_turn(self) -> Iterator[Seat]:
+        """Each seat once; whoever stops early is given the next ones another time."""
+        for _ in self._all:
+            seat = self._all[self._next_look]
+            self._next_look = (self._next_look + 1) % len(self._all)
+            yield seat

@@ -1,0 +1,69 @@
+"""What is drawn for each rollout before anything is simulated.
+
+A rollout is a pure function of its plan and its number: object, hidden dynamics, camera, states and actions are drawn
+from seeds derived from these alone, so that it comes out the same whichever worker runs it, whenever.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from shared import seeds
+from shared.config import DynamicsRanges, Range
+from shared.hidden import ALWAYS_DRAWN
+from shared.plan import ObjectRef, Plan
+from shared.tasks import Task
+from shared.types import HiddenDynamics
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """What is drawn for one rollout before anything is simulated."""
+
+    index: int
+    object: ObjectRef
+    dynamics: HiddenDynamics
+    azimuth_deg: float
+    elevation_deg: float
+
+
+def draw_rollout(plan: Plan, index: int, attempt: int = 0) -> Draw:
+    """The draw of rollout `index`; a further `attempt` draws another camera only."""
+    setting = plan.setting
+    ranges = setting.dynamics
+    rng = seeds.generator(setting.seed, f"dynamics/{plan.key}", index)
+    dynamics = draw_dynamics(ranges, setting.task_record, rng)
+    for name in ranges.added:
+        # From a stream of its own, so that what else is drawn does not depend on it.
+        rng = seeds.generator(setting.seed, f"dynamics/{name}/{plan.key}", index)
+        dynamics = replace(dynamics, values={**dynamics.values, name: draw_range(ranges[name], rng)})
+    camera = setting.collection.camera
+    rng = seeds.generator(setting.seed, f"camera/{plan.key}", index, attempt)
+    return Draw(
+        index,
+        object_of(plan, index),
+        dynamics,
+        draw_range(camera.azimuth_deg, rng),
+        draw_range(camera.elevation_deg, rng),
+    )
+
+
+def object_of(plan: Plan, index: int) -> ObjectRef:
+    """Every object once, in a random order, before any comes again."""
+    objects = plan.setting.objects
+    turn, place = divmod(index, len(objects))
+    order = seeds.generator(plan.setting.seed, f"objects/{plan.key}", turn).permutation(len(objects))
+    return objects[int(order[place])]
+
+
+def draw_dynamics(ranges: DynamicsRanges, task: Task, rng: np.random.Generator) -> HiddenDynamics:
+    """The hidden parameters that are always drawn, within `ranges`, with one of the task's direction modes."""
+    values = {name: draw_range(ranges[name], rng) for name in ALWAYS_DRAWN}
+    return HiddenDynamics(values, task.directions[int(rng.integers(len(task.directions)))])
+
+
+def draw_range(interval: Range, rng: np.random.Generator) -> float:
+    """A number within an interval."""
+    if interval.log:
+        return float(np.exp(rng.uniform(np.log(interval.low), np.log(interval.high))))
+    return float(rng.uniform(interval.low, interval.high))

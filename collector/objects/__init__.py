@@ -1,0 +1,1 @@
+"""Articulated objects: reading folders, meshes and URDF, decomposition, and procedural ones."""

@@ -1,0 +1,118 @@
+"""An articulated object as the scene and the camera need it: rigid bodies joined by moving joints.
+
+Links that a fixed joint ties together are one body. Body 0 is the static root; body k >= 1 is the k-th movable part
+and hangs on its parent by exactly one moving joint, parents before children.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.plan import ObjectRef
+from shared.types import Float
+
+MIN_RANGE = 1e-6
+"""A joint whose limits are closer than this cannot move."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """Triangles in the frame of their body, at the joint's zero position."""
+
+    vertices: Float
+    """[V, 3]."""
+    faces: NDArray[np.int32]
+    """[F, 3], indices into `vertices`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """The moving joint that a part hangs on."""
+
+    name: str
+    kind: Literal["revolute", "prismatic"]
+    parent: int
+    """Body that it hangs on."""
+    parent_from_body: Float
+    """[4, 4], pose of the body's frame in its parent's at joint position 0; the axis passes through its origin."""
+    axis: Float
+    """[3], unit, in the body's frame."""
+    lower: float
+    """rad or length; infinite limits are cut to -pi, as published."""
+    upper: float
+    """Likewise, cut to pi."""
+
+    @property
+    def span(self) -> float:
+        """Upper limit minus lower limit."""
+        return self.upper - self.lower
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """One rigid body."""
+
+    link: str
+    """Name in the URDF of the link that the joint moves (of the root for body 0)."""
+    part_name: str
+    """What the part is, from semantics.txt, such as "rotation_door"; "" where that is silent."""
+    joint: Joint | None
+    """None for the root."""
+    visuals: tuple[Mesh, ...]
+    """What a camera sees."""
+    collisions: tuple[Mesh, ...]
+    """Each stands for its convex hull in physics."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class ArticulatedObject:
+    """A whole object, root link at the world's origin; equal to itself alone."""
+
+    ref: ObjectRef
+    bodies: tuple[Body, ...]
+    notes: tuple[str, ...] = ()
+    """What of its files was left out or read otherwise, for the user to know: one phrase each."""
+
+    @property
+    def parts(self) -> tuple[Body, ...]:
+        """The movable bodies; part id k is `parts[k - 1]`."""
+        return self.bodies[1:]
+
+    def limits(self) -> Float:
+        """[parts, 2], lower and upper joint limits."""
+        return np.array([[b.joint.lower, b.joint.upper] for b in self.parts if b.joint is not None]).reshape(-1, 2)
+
+    def body_poses(self, joint_positions: Float) -> Float:
+        """world_from_body, [bodies, 4, 4], at the given joint positions [parts]."""
+        poses = np.tile(np.eye(4), (len(self.bodies), 1, 1))
+        for k, (body, position) in enumerate(zip(self.parts, joint_positions, strict=True), start=1):
+            assert body.joint is not None
+            poses[k] = poses[body.joint.parent] @ body.joint.parent_from_body @ joint_motion(body.joint, position)
+        return poses
+
+
+def joint_motion(joint: Joint, position: float) -> Float:
+    """[4, 4], where a joint at `position` takes the body from where position 0 has it."""
+    motion = np.eye(4)
+    if joint.kind == "prismatic":
+        motion[:3, 3] = position * joint.axis
+        return motion
+    x, y, z = joint.axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    motion[:3, :3] = np.eye(3) + np.sin(position) * cross + (1 - np.cos(position)) * (cross @ cross)
+    return motion
+
+
+def joint_twist(joint: Joint, world_from_body: Float) -> Float:
+    """(w, v), [6], world frame: a point p of the body starts to move by w x p + v a unit of joint position.
+
+    Args:
+        joint: that the body hangs on.
+        world_from_body: [4, 4], the body's pose; the axis passes through its origin.
+    """
+    axis = world_from_body[:3, :3] @ joint.axis
+    if joint.kind == "prismatic":
+        return np.concatenate([np.zeros(3), axis])
+    return np.concatenate([axis, np.cross(world_from_body[:3, 3], axis)])

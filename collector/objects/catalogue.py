@@ -1,0 +1,269 @@
+"""The objects of a folder: which can be used, which cannot and why, which suit a task, and how they are split.
+
+A catalogue keeps a few words an object; geometry is read when it is wanted (`load`).
+"""
+
+import re
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from collector.objects.articulation import MIN_RANGE, ArticulatedObject
+from collector.objects.decomposition import Decomposer
+from collector.objects.files import short
+from collector.objects.readers import READERS, read_object, reader_of
+from shared.config import Collision
+from shared.errors import ObjectError, UsageError
+from shared.io.files import read_named
+from shared.io.private import cache_folder
+from shared.plan import ObjectRef
+from shared.seeds import generator
+from shared.tasks import Task
+
+MAX_LIST_BYTES = 1 << 20
+_OBJECT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+@dataclass(frozen=True, slots=True)
+class PartSummary:
+    """What a task asks of a movable part."""
+
+    name: str
+    """Semantic name; "" where semantics.txt is silent."""
+    kind: Literal["revolute", "prismatic"]
+    span: float
+    """Upper limit minus lower limit, rad or length."""
+    visible: bool
+    """Whether it has any visual mesh."""
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueEntry:
+    """One usable object; `parts[k - 1]` is its part k."""
+
+    ref: ObjectRef
+    folder: Path
+    parts: tuple[PartSummary, ...]
+    tree: Path
+    """The folder that was scanned, below which links are followed."""
+    notes: tuple[str, ...] = ()
+    """What was left out or read otherwise, one phrase each."""
+
+    @property
+    def movable(self) -> int:
+        """How many parts can move."""
+        return sum(part.span > MIN_RANGE for part in self.parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Catalogue:
+    """The objects of a folder, ordered by id."""
+
+    usable: tuple[CatalogueEntry, ...]
+    refused: tuple[tuple[str, str], ...]
+    """(id, reason in one line)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectSplit:
+    """Disjoint sets of objects."""
+
+    train: tuple[ObjectRef, ...]
+    validation: tuple[ObjectRef, ...]
+    test: tuple[ObjectRef, ...]
+
+
+def scan(path: Path, *object_lists: Path) -> Catalogue:
+    """Read and check every object below `path`.
+
+    Args:
+        path: a folder of object folders, or one object's folder. Files and hidden folders in it are ignored.
+        object_lists: Where2Act lists, `<id> <category>` a line; where there are any, only their objects are looked at.
+
+    Raises:
+        UsageError: `path` or a list cannot be read, or there is no object at all.
+    """
+    folders = _object_folders(path)
+    if object_lists:
+        listed = dict.fromkeys(object_id for each in object_lists for object_id in read_list(each))
+        if not listed:
+            names = ", ".join(str(each) for each in object_lists)
+            raise UsageError(f"{names}: names no object; name a list of '<id> <category>' lines")
+        folders = {object_id: folders.get(object_id, path / object_id) for object_id in listed}
+    elif all(reader_of(folder) is None for folder in folders.values()):
+        layouts = ", ".join(READERS.names())
+        raise UsageError(f"{path}: holds no object; name a folder of objects ({layouts}), or one object's folder")
+    usable, refused = [], []
+    for object_id in sorted(folders):
+        try:
+            usable.append(_entry(folders[object_id], path))
+        except ObjectError as error:
+            refused.append((object_id, str(error)))
+    return Catalogue(tuple(usable), tuple(refused))
+
+
+def read_list(path: Path) -> tuple[str, ...]:
+    """The ids of a Where2Act list: `<id> <category>` a line, more words are ignored; categories come from meta.json.
+
+    Raises:
+        UsageError: the list cannot be read, or a line does not start with an id.
+    """
+    advice = "name a list of '<id> <category>' lines"
+    try:
+        lines = read_named(path, MAX_LIST_BYTES, advice).decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise UsageError(f"{path}: not text; name a list of '<id> <category>' lines") from None
+    ids = [line.split()[0] for line in lines if line.strip()]
+    for object_id in ids:
+        if not _OBJECT_ID.fullmatch(object_id):
+            raise UsageError(f"{path}: {short(object_id)} is not an object's id; a line is '<id> <category>'")
+    return tuple(dict.fromkeys(ids))
+
+
+def load(entry: CatalogueEntry) -> ArticulatedObject:
+    """The object's geometry.
+
+    Raises:
+        ObjectError: its files cannot be read, or are not those that were catalogued.
+    """
+    return _load(entry.folder, entry.tree, entry.ref)
+
+
+def load_ref(path: Path, ref: ObjectRef, collision: Collision = "hulls") -> ArticulatedObject:
+    """The object `ref` below `path`, which is what `scan` was given: a folder of objects, or the object's own.
+
+    Args:
+        path: the folder.
+        ref: which object.
+        collision: whether its collision meshes are taken as they are, or decomposed first.
+
+    Raises:
+        ObjectError: there is none, its files are not those that `ref` was made from, or it cannot be decomposed.
+    """
+    loaded = _load(path / ref.id if reader_of(path) is None else path.resolve(), path, ref)
+    if collision == "hulls":
+        return loaded
+    with Decomposer(cache_folder("pieces")) as decomposer:
+        return decomposer.decomposed(loaded)
+
+
+def for_task(catalogue: Catalogue, task: Task) -> Catalogue:
+    """The catalogue in which only objects that `task` may act on are usable."""
+    return _without(catalogue, lambda entry: None if qualifying_parts(entry, task) else _unfit_reason(entry, task))
+
+
+def of_categories(catalogue: Catalogue, categories: Collection[str]) -> Catalogue:
+    """The catalogue in which only objects of some categories are usable; of any where none is named."""
+
+    def reason(entry: CatalogueEntry) -> str | None:
+        if not categories or entry.ref.category in categories:
+            return None
+        return f"a {entry.ref.category}; only {', '.join(categories)} are asked for"
+
+    return _without(catalogue, reason)
+
+
+def qualifying_parts(described: CatalogueEntry | ArticulatedObject, task: Task) -> tuple[int, ...]:
+    """The parts (1-based) that `task` may act on: visible, able to move, and of the kind that it names."""
+    if task.categories and described.ref.category not in task.categories:
+        return ()
+    parts = described.parts if isinstance(described, CatalogueEntry) else summaries(described)
+    return tuple(number for number, part in enumerate(parts, start=1) if _qualifies(part, task))
+
+
+def split(refs: Iterable[ObjectRef], fractions: tuple[float, float, float], seed: int) -> ObjectSplit:
+    """Split objects into train, validation and test, each category alike: a pure function of its arguments.
+
+    Each set whose fraction is not zero gets an object wherever there are as many objects as such sets.
+
+    Args:
+        refs: in any order.
+        fractions: of train, validation and test; non-negative, and they sum to 1.
+        seed: decides which objects go where.
+
+    Raises:
+        UsageError: the fractions are negative or do not sum to 1.
+    """
+    if min(fractions) < 0 or abs(sum(fractions) - 1) > 1e-6:
+        raise UsageError(f"fractions of train, validation and test must sum to 1; given {fractions}")
+    ordered = _stratified_order(refs, seed)
+    sets: list[list[ObjectRef]] = [[], [], []]
+    for count, ref in enumerate(ordered, start=1):
+        # Each object goes where the fewest are compared with what the fractions ask for: neighbours in the order are
+        # of one category, so that each category is dealt out alike.
+        shortfall = [fraction * count - len(chosen) for fraction, chosen in zip(fractions, sets, strict=True)]
+        sets[int(np.argmax(shortfall))].append(ref)
+    wanted = [index for index, fraction in enumerate(fractions) if fraction > 0]
+    for index in wanted:
+        if not sets[index] and len(ordered) >= len(wanted):
+            sets[index].append(max(sets, key=len).pop())
+    train, validation, test = (tuple(sorted(chosen, key=lambda ref: ref.id)) for chosen in sets)
+    return ObjectSplit(train, validation, test)
+
+
+def summaries(described: ArticulatedObject) -> tuple[PartSummary, ...]:
+    """What tasks ask of each part of an object."""
+    return tuple(
+        PartSummary(body.part_name, body.joint.kind, body.joint.span, bool(body.visuals))
+        for body in described.parts
+        if body.joint is not None
+    )
+
+
+def _object_folders(path: Path) -> dict[str, Path]:
+    """Object folders by id."""
+    if not path.is_dir():
+        raise UsageError(f"{path}: no such folder; name a folder of objects, or one object's folder")
+    if reader_of(path) is not None:
+        return {path.resolve().name: path.resolve()}
+    try:
+        return {child.name: child for child in path.iterdir() if child.is_dir() and not child.name.startswith(".")}
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _entry(folder: Path, tree: Path) -> CatalogueEntry:
+    described = read_object(folder, tree)
+    return CatalogueEntry(described.ref, folder, summaries(described), tree, described.notes)
+
+
+def _load(folder: Path, tree: Path, ref: ObjectRef) -> ArticulatedObject:
+    loaded = read_object(folder, tree)
+    if loaded.ref != ref:
+        raise ObjectError(
+            f"{folder}: is not the object that was planned ({loaded.ref.id} {loaded.ref.content_hash[:12]} instead of "
+            f"{ref.id} {ref.content_hash[:12]}); restore its files or start anew"
+        )
+    return loaded
+
+
+def _qualifies(part: PartSummary, task: Task) -> bool:
+    named = not task.part_names or any(name in part.name for name in task.part_names)
+    turns = part.kind == "revolute" or not task.revolute_only
+    return named and turns and part.visible and part.span > MIN_RANGE
+
+
+def _without(catalogue: Catalogue, reason: Callable[[CatalogueEntry], str | None]) -> Catalogue:
+    """The catalogue in which every object that there is a reason against is refused for it."""
+    reasons = [(entry, reason(entry)) for entry in catalogue.usable]
+    refused = [(entry.ref.id, against) for entry, against in reasons if against is not None]
+    usable = tuple(entry for entry, against in reasons if against is None)
+    return Catalogue(usable, tuple(sorted([*catalogue.refused, *refused])))
+
+
+def _unfit_reason(entry: CatalogueEntry, task: Task) -> str:
+    if task.categories and entry.ref.category not in task.categories:
+        return f"the task '{task.name}' is for {', '.join(task.categories)}; this is a {entry.ref.category}"
+    return f"no part that the task '{task.name}' may act on"
+
+
+def _stratified_order(refs: Iterable[ObjectRef], seed: int) -> Sequence[ObjectRef]:
+    """The objects category by category, shuffled within each."""
+    by_category: dict[str, list[ObjectRef]] = {}
+    for ref in sorted(refs, key=lambda ref: ref.id):
+        by_category.setdefault(ref.category, []).append(ref)
+    rng = generator(seed, "object split")
+    return [by_category[name][i] for name in sorted(by_category) for i in rng.permutation(len(by_category[name]))]

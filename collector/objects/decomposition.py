@@ -1,0 +1,193 @@
+"""Convex decomposition of collision meshes, so that cavities stay open: by CoACD, once a mesh, cached by its content.
+
+    opened = Decomposer(cache_folder("pieces")).decomposed(target)
+
+The cache is shared by all processes of a machine. Its entries are checked like any file from outside: what is damaged
+or does not fit its mesh is computed again.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import signal
+import subprocess
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from collector.objects.articulation import ArticulatedObject, Body, Mesh
+from collector.objects.bounds import check_bounds
+from collector.objects.coacd_process import MAX_PIECES, SETTINGS, receive, send
+from collector.objects.mesh_bytes import MAX_ENCODED_BYTES, decode, encode
+from shared.errors import ObjectError, StoreError, UsageError
+from shared.io.files import read_bounded, remove_tree, write_atomically
+from shared.io.interpreter import PYTHON, own_environment
+
+LIMIT_S = 120.0
+"""CPU time for one mesh; the largest of published objects take some 20 s."""
+MAX_MESH_TRIANGLES = 200_000
+FLAT = 1e-4
+"""What is thinner than this holds no cavity."""
+SLACK = 0.1
+"""How far pieces may stand out of their mesh's bounding box: preprocessing thickens surfaces."""
+
+
+class Decomposer:
+    """Decomposes objects; a context that ends the process it may have started.
+
+    Args:
+        cache: folder of the cache; made where missing.
+
+    Example:
+        >>> with Decomposer(cache_folder("pieces")) as decomposer:
+        ...     opened = decomposer.decomposed(target)
+    """
+
+    def __init__(self, cache: Path) -> None:
+        self._cache = cache
+        self._child: subprocess.Popen[bytes] | None = None
+        self._salt = json.dumps([version("coacd"), SETTINGS], sort_keys=True).encode()
+
+    def __enter__(self) -> "Decomposer":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._child is not None:
+            self._child.kill()
+        self._end_child()
+
+    def decomposed(
+        self, target: ArticulatedObject, progress: Callable[[int, int], None] | None = None
+    ) -> ArticulatedObject:
+        """`target` with each collision mesh that has cavities replaced by convex pieces.
+
+        Args:
+            target: the object.
+            progress: called with how many meshes are done, and how many there are.
+
+        Raises:
+            ObjectError: a mesh is too large, takes too long or ends the library, or there are too many pieces.
+            UsageError: the cache cannot be written.
+        """
+        total, done = sum(len(body.collisions) for body in target.bodies), 0
+        bodies: list[Body] = []
+        for body in target.bodies:
+            pieces: list[Mesh] = []
+            for mesh in body.collisions:
+                try:
+                    pieces.extend(self.pieces(mesh))
+                except ObjectError as error:
+                    raise ObjectError(f"object {target.ref.id}, link '{body.link}': {error}") from None
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+            bodies.append(dataclasses.replace(body, collisions=tuple(pieces)))
+        try:
+            check_bounds(bodies)
+        except ObjectError as error:
+            raise ObjectError(f"object {target.ref.id}, decomposed: {error}") from None
+        return dataclasses.replace(target, bodies=tuple(bodies))
+
+    def pieces(self, mesh: Mesh) -> tuple[Mesh, ...]:
+        """The convex pieces of one mesh; the mesh itself where one piece is enough.
+
+        Raises:
+            ObjectError: it is too large, takes too long or ends the library.
+            UsageError: the cache cannot be written.
+        """
+        if _is_flat(mesh):
+            return (mesh,)
+        if len(mesh.faces) > MAX_MESH_TRIANGLES:
+            raise ObjectError(f"a mesh of {len(mesh.faces)} triangles; at most {MAX_MESH_TRIANGLES} are decomposed")
+        key = hashlib.sha256(self._salt + encode([mesh])).hexdigest()
+        path = self._cache / key[:2] / key
+        found = _cached(path, mesh)
+        if found is None:
+            found = self._computed(mesh)
+            _keep(path, found)
+        return found or (mesh,)
+
+    def _computed(self, mesh: Mesh) -> tuple[Mesh, ...]:
+        """The pieces, or none where one is enough."""
+        child = self._running()
+        assert child.stdin is not None
+        assert child.stdout is not None
+        try:
+            send(child.stdin, [mesh])
+            found = receive(child.stdout)
+        except (EOFError, ValueError, BrokenPipeError):
+            too_slow = self._end_child() == -signal.SIGPROF
+            what = f"takes longer than {LIMIT_S:g} s to decompose" if too_slow else "cannot be decomposed by CoACD"
+            raise ObjectError(f"a mesh of {len(mesh.faces)} triangles {what}; use convex hulls") from None
+        if len(found) <= 1:
+            return ()
+        if not _fits(found, mesh):
+            raise ObjectError("CoACD's pieces do not fit their mesh; use convex hulls")
+        return found
+
+    def _running(self) -> "subprocess.Popen[bytes]":
+        if self._child is None or self._child.poll() is not None:
+            self._child = subprocess.Popen(
+                [*PYTHON, "-m", "collector.objects.coacd_process", str(LIMIT_S)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                # Sums over several threads would depend on how many there are.
+                env={**own_environment(), "OMP_NUM_THREADS": "1"},
+            )
+        return self._child
+
+    def _end_child(self) -> int:
+        """End the process, if there is one; returns its exit code, or minus the signal that it died of."""
+        if self._child is None:
+            return 0
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            # One that failed is about to be gone, and how tells why.
+            self._child.wait(0.2)
+        self._child.kill()
+        self._child.communicate()
+        code, self._child = self._child.returncode, None
+        return code
+
+
+def _is_flat(mesh: Mesh) -> bool:
+    """Whether all vertices lie in a plane, about: such a mesh has no cavity, and CoACD may not end on it."""
+    spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), compute_uv=False)
+    return len(mesh.vertices) < 4 or bool(spread[-1] / np.sqrt(len(mesh.vertices)) < FLAT)
+
+
+def _fits(pieces: Sequence[Mesh], mesh: Mesh) -> bool:
+    """Whether there are few enough pieces, each with vertices, about where the mesh is."""
+    low, high = mesh.vertices.min(axis=0) - SLACK, mesh.vertices.max(axis=0) + SLACK
+    return len(pieces) <= MAX_PIECES and all(
+        len(piece.vertices) >= 4 and (piece.vertices >= low).all() and (piece.vertices <= high).all()
+        for piece in pieces
+    )
+
+
+def _cached(path: Path, mesh: Mesh) -> tuple[Mesh, ...] | None:
+    """The pieces of a cache entry; None where there is none that is sound."""
+    try:
+        found = decode(read_bounded(path, MAX_ENCODED_BYTES))
+    except (StoreError, ValueError):
+        return None
+    return found if len(found) != 1 and _fits(found, mesh) else None
+
+
+def _keep(path: Path, pieces: tuple[Mesh, ...]) -> None:
+    """Put pieces into the cache."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            remove_tree(path)
+        write_atomically(path, encode(pieces))
+    except OSError as error:
+        raise UsageError(
+            f"{path.parent}: the cache cannot be written ({error.strerror}); set XDG_CACHE_HOME to a folder that can"
+        ) from None

@@ -1,0 +1,58 @@
+"""Appliances with a door and controls: Microwave, WashingMachine."""
+
+import numpy as np
+
+from collector.objects.procedural.assembly import MovablePart, ProceduralObject, hinged, sliding
+from collector.objects.procedural.cabinets import GAP, knob
+from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, Pieces, block, grip, hollow_box, rod
+
+BUTTON_TRAVEL = 0.03
+
+
+def random_microwave(rng: np.random.Generator) -> ProceduralObject:
+    """A door hinged at the left, and buttons and perhaps a dial at its right."""
+    width, depth, height = float(rng.uniform(1.2, 1.5)), float(rng.uniform(0.8, 1.0)), float(rng.uniform(0.65, 0.85))
+    panel, thickness = float(rng.uniform(0.25, 0.35)), 0.05
+    half, split = width / 2, -width / 2 + panel
+    body = (
+        *hollow_box((0.0, split, 0.0), (depth, half, height), 0.04, (FRONT,)),
+        block((-thickness, -half, 0.0), (depth, split - GAP, height)),
+    )
+    low, high = (-GAP - thickness, split + GAP, 0.0), (-GAP, half, height)
+    pieces: Pieces = (block(low, high),)
+    pieces += grip((low[0], split + 0.09, height / 2), TOP, FRONT, 0.6 * height, 0.08, 0.016)
+    door = hinged("door", pieces, (low[0], half, height / 2), LEFT, FRONT, float(rng.uniform(1.5, 2.0)))
+    middle = (-half + split) / 2
+    rows = np.linspace(0.15, 0.55, int(rng.integers(2, 5))) * height
+    buttons = [_button(-thickness, middle + y, float(z), 0.045) for z in rows for y in (-0.07, 0.07)]
+    dial = [knob("knob", (-thickness, middle, 0.8 * height), 0.07)] if rng.random() < 0.5 else []
+    return ProceduralObject("Microwave", "microwave_body", body, (door, *buttons, *dial))
+
+
+def random_washing_machine(rng: np.random.Generator) -> ProceduralObject:
+    """A round door before an opening in the front; a dial and buttons above it."""
+    width, depth, height = float(rng.uniform(0.95, 1.1)), float(rng.uniform(0.8, 1.0)), float(rng.uniform(1.2, 1.4))
+    half, radius, middle = width / 2, 0.36 * width, 0.48 * height
+    hole = 0.7 * radius
+    body = (
+        *hollow_box((0.0, -half, 0.0), (depth, half, height), 0.04, (FRONT,)),
+        block((0.0, -half + 0.04, 0.04), (0.04, half - 0.04, middle - hole)),
+        block((0.0, -half + 0.04, middle + hole), (0.04, half - 0.04, height - 0.04)),
+        block((0.0, -half + 0.04, middle - hole), (0.04, -hole, middle + hole)),
+        block((0.0, hole, middle - hole), (0.04, half - 0.04, middle + hole)),
+    )
+    left, face = bool(rng.random() < 0.5), -GAP - 0.06
+    side = 1.0 if left else -1.0
+    disc: Pieces = (rod((-GAP, 0.0, middle), (face, 0.0, middle), radius, 0.95 * radius, sides=32),)
+    disc += grip((face, -0.75 * side * radius, middle), TOP, FRONT, 0.3 * radius + 0.1, 0.07, 0.015)
+    corner = (face, side * radius, middle)
+    door = hinged("door", disc, corner, LEFT if left else RIGHT, FRONT, float(rng.uniform(1.5, 2.2)))
+    dial = knob("knob", (0.0, 0.2 * width, 0.93 * height), 0.05)
+    buttons = [_button(0.0, -y * width, 0.93 * height, 0.03) for y in (0.0, 0.12, 0.24)]
+    return ProceduralObject("WashingMachine", "washing_machine_body", body, (door, dial, *buttons))
+
+
+def _button(face: float, y: float, z: float, half: float) -> MovablePart:
+    """A button on a front at x = `face`, which goes in when it is pressed."""
+    piece = block((face - BUTTON_TRAVEL, y - half, z - half), (face - 0.002, y + half, z + half))
+    return sliding("button", (piece,), BACK, 0.9 * BUTTON_TRAVEL)

@@ -1,0 +1,48 @@
+"""Which categories there are, and one object of each from a seed."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from collector.objects.procedural.appliances import random_microwave, random_washing_machine
+from collector.objects.procedural.assembly import ProceduralObject, normalised
+from collector.objects.procedural.cabinets import (
+    random_refrigerator,
+    random_safe,
+    random_storage_furniture,
+    random_table,
+)
+from collector.objects.procedural.containers import (
+    random_box,
+    random_bucket,
+    random_kettle,
+    random_kitchen_pot,
+    random_trash_can,
+)
+from collector.objects.procedural.faucets import random_faucet
+from collector.objects.procedural.openings import random_door, random_switch, random_window
+from shared.seeds import generator
+
+CATEGORIES: Mapping[str, Callable[[np.random.Generator], ProceduralObject]] = {
+    "StorageFurniture": random_storage_furniture,
+    "Faucet": random_faucet,
+    "Box": random_box,
+    "Microwave": random_microwave,
+    "Refrigerator": random_refrigerator,
+    "Door": random_door,
+    "TrashCan": random_trash_can,
+    "Kettle": random_kettle,
+    "Switch": random_switch,
+    "Window": random_window,
+    "Table": random_table,
+    "WashingMachine": random_washing_machine,
+    "Bucket": random_bucket,
+    "KitchenPot": random_kitchen_pot,
+    "Safe": random_safe,
+}
+"""The paper's fifteen, called as PartNet-Mobility calls them."""
+
+
+def build(category: str, seed: int, index: int) -> ProceduralObject:
+    """Object number `index` of a category: a pure function of its arguments, whatever else is made."""
+    return normalised(CATEGORIES[category](generator(seed, f"procedural {category}", index)))

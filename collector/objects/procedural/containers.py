@@ -1,0 +1,113 @@
+"""Vessels with lids and handles: Box, TrashCan, KitchenPot, Bucket, Kettle."""
+
+import numpy as np
+
+from collector.objects.procedural.assembly import MovablePart, ProceduralObject, hinged, sliding
+from collector.objects.procedural.cabinets import GAP
+from collector.objects.procedural.shapes import (
+    BACK,
+    LEFT,
+    RIGHT,
+    TOP,
+    Pieces,
+    Point,
+    arch,
+    block,
+    hollow_box,
+    moved,
+    rod,
+    tub,
+)
+
+
+def random_box(rng: np.random.Generator) -> ProceduralObject:
+    """A box with one lid hinged at the back, or two flaps that meet in the middle."""
+    width, depth, height = float(rng.uniform(0.9, 1.3)), float(rng.uniform(0.7, 1.1)), float(rng.uniform(0.5, 0.9))
+    body = hollow_box((0.0, -width / 2, 0.0), (depth, width / 2, height), 0.03, (TOP,))
+    overhang, opens = float(rng.uniform(0.02, 0.04)), float(rng.uniform(1.6, 2.2))
+    low, high = (-overhang, -width / 2 - overhang, height + GAP), (depth, width / 2 + overhang, height + GAP + 0.03)
+    if rng.random() < 0.5:
+        lids: tuple[MovablePart, ...] = (_lid(low, high, BACK, opens),)
+    else:
+        lids = (
+            _lid((low[0], GAP / 2, low[2]), high, LEFT, opens),
+            _lid(low, (high[0], -GAP / 2, high[2]), RIGHT, opens),
+        )
+    return ProceduralObject("Box", "box_body", body, lids)
+
+
+def random_trash_can(rng: np.random.Generator) -> ProceduralObject:
+    """A bin, square or round, whose lid turns up at the back."""
+    radius, height = float(rng.uniform(0.35, 0.5)), float(rng.uniform(1.0, 1.4))
+    overhang, opens = float(rng.uniform(0.02, 0.04)), float(rng.uniform(1.3, 1.9))
+    if rng.random() < 0.5:
+        body = hollow_box((-radius, -radius, 0.0), (radius, radius, height), 0.03, (TOP,))
+        reach = radius + overhang
+        lid = _lid((-reach, -reach, height + GAP), (radius, reach, height + GAP + 0.05), BACK, opens)
+    else:
+        body = tub(0.85 * radius, radius, 0.0, height, 0.03)
+        reach, top = radius + overhang, height + GAP + 0.05
+        plate = rod((0.0, 0.0, height + GAP), (0.0, 0.0, top), reach, 0.95 * reach, sides=24)
+        lid = hinged("rotation_lid", (plate,), (reach, 0.0, top), BACK, TOP, opens)
+    return ProceduralObject("TrashCan", "trashcan_body", body, (lid,))
+
+
+def random_kitchen_pot(rng: np.random.Generator) -> ProceduralObject:
+    """A pot with two ears and a loose lid."""
+    radius, height = float(rng.uniform(0.5, 0.65)), float(rng.uniform(0.4, 0.8))
+    body = tub(0.95 * radius, radius, 0.0, height, 0.04)
+    ears = tuple(
+        block((-0.12, min(y, y + side * 0.16), height - 0.14), (0.12, max(y, y + side * 0.16), height - 0.1))
+        for side in (-1.0, 1.0)
+        for y in [side * (radius - 0.02)]
+    )
+    lid = sliding("lid", _round_lid(1.03 * radius, height), TOP, float(rng.uniform(0.15, 0.3)))
+    return ProceduralObject("KitchenPot", "pot_body", body + ears, (lid,))
+
+
+def random_bucket(rng: np.random.Generator) -> ProceduralObject:
+    """A pail whose handle lies forward on its rim and turns up."""
+    radius, height = float(rng.uniform(0.5, 0.65)), float(rng.uniform(0.7, 1.0))
+    body = tub(float(rng.uniform(0.7, 0.85)) * radius, radius, 0.0, height, 0.03)
+    pivot = (0.0, 0.0, height + 0.05)
+    pins = tuple(
+        block((-0.03, min(y, 1.12 * y), height - 0.08), (0.03, max(y, 1.12 * y), height + 0.08))
+        for y in (radius, -radius)
+    )
+    handle = moved(arch(1.18 * radius, 0.025, lean=np.pi / 2), pivot)
+    # Turned about +y, what lies towards -x rises.
+    part = MovablePart("handle", "revolute", handle, pivot, LEFT, float(rng.uniform(1.5, 2.8)))
+    return ProceduralObject("Bucket", "bucket_body", body + pins, (part,))
+
+
+def random_kettle(rng: np.random.Generator) -> ProceduralObject:
+    """A kettle: spout to the left, handle to the right, lid on top."""
+    radius, height = float(rng.uniform(0.4, 0.5)), float(rng.uniform(0.6, 0.9))
+    top = 0.7 * radius
+    body = tub(radius, top, 0.0, height, 0.04)
+    spout = rod((0.0, 0.8 * radius, 0.35 * height), (0.0, 1.5 * radius, 0.95 * height), 0.1, 0.05)
+    posts = [(0.0, -1.35 * radius, z * height) for z in (0.25, 0.9)]
+    handle = (
+        rod((0.0, -0.8 * radius, 0.25 * height), posts[0], 0.035, sides=10),
+        rod((0.0, -0.7 * radius, 0.9 * height), posts[1], 0.035, sides=10),
+        rod(posts[0], posts[1], 0.04, sides=10),
+    )
+    lid = sliding("lid", _round_lid(0.97 * top, height), TOP, float(rng.uniform(0.1, 0.25)))
+    return ProceduralObject("Kettle", "kettle_body", (*body, spout, *handle), (lid,))
+
+
+def _lid(low: Point, high: Point, edge: Point, opens: float) -> MovablePart:
+    """A flat lid over an open top, turning up about the edge towards `edge`."""
+    middle, half = np.add(low, high) / 2, np.subtract(high, low) / 2
+    corner = middle + half * edge
+    return hinged("rotation_lid", (block(low, high),), (float(corner[0]), float(corner[1]), high[2]), edge, TOP, opens)
+
+
+def _round_lid(radius: float, height: float) -> Pieces:
+    """A domed lid at `height`, with a knob to pinch."""
+    base = height + GAP
+    return (
+        rod((0.0, 0.0, base), (0.0, 0.0, base + 0.06), radius, 0.8 * radius, sides=24),
+        rod((0.0, 0.0, base + 0.06), (0.0, 0.0, base + 0.13), 0.025, sides=10),
+        rod((0.0, 0.0, base + 0.13), (0.0, 0.0, base + 0.18), 0.06, sides=12),
+    )

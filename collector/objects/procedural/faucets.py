@@ -1,0 +1,77 @@
+"""Faucets: a column, a spout, and one or two switches whose turning direction cannot be seen."""
+
+import numpy as np
+
+from collector.objects.procedural.assembly import MovablePart, ProceduralObject
+from collector.objects.procedural.shapes import BOTTOM, TOP, Pieces, Point, block, moved, rod
+
+
+def random_faucet(rng: np.random.Generator) -> ProceduralObject:
+    """One switch on top of the column, or two on pedestals beside it; the sense of each axis is drawn."""
+    height, radius = float(rng.uniform(0.7, 1.1)), float(rng.uniform(0.08, 0.13))
+    reach = float(rng.uniform(0.7, 1.0))
+    twin = bool(rng.random() < 0.5)
+    spout_height = height if twin else height * float(rng.uniform(0.55, 0.75))
+    spout = _spout(reach, spout_height, 0.6 * radius)
+    style = rng.choice(["lever", "cross", "knob"])
+    if twin:
+        half, low = float(rng.uniform(0.4, 0.55)), float(rng.uniform(0.15, 0.3))
+        stands = [(0.0, half, low), (0.0, -half, low)]
+        plate = block((-0.18, -half - 0.18, -0.06), (0.18, half + 0.18, 0.0))
+        pedestals = tuple(rod((x, y, 0.0), (x, y, z), 0.8 * radius, 0.6 * radius) for x, y, z in stands)
+    else:
+        stands = [(0.0, 0.0, height)]
+        plate = rod((0.0, 0.0, -0.06), (0.0, 0.0, 0.0), 2.0 * radius, sides=24)
+        pedestals = ()
+    body: Pieces = (plate, rod((0.0, 0.0, 0.0), (0.0, 0.0, height), radius, 0.9 * radius), *pedestals)
+    size, upper = float(rng.uniform(0.25, 0.4)), float(rng.uniform(0.5, 1.0) * np.pi)
+    # A lever points back or forward, so that neither sense of turning is the likelier.
+    heading = 0.0 if twin or rng.random() < 0.5 else np.pi
+    switches = [_switch(str(style), stand, size, heading, upper, rng) for stand in stands]
+    if twin and rng.random() < 0.4:
+        turning = MovablePart("spout", "revolute", spout, (0.0, 0.0, height), TOP, np.pi / 2)
+        return ProceduralObject("Faucet", "faucet_base", body, (*switches, turning))
+    return ProceduralObject("Faucet", "faucet_base", body + spout, tuple(switches))
+
+
+def _spout(reach: float, height: float, radius: float) -> Pieces:
+    """A pipe forward from the column, and its mouth."""
+    tip = (-reach, 0.0, height)
+    return (
+        rod((0.0, 0.0, height - 0.06), tip, radius),
+        rod((-reach + radius, 0.0, height), (-reach + radius, 0.0, height - 0.15), 0.8 * radius),
+    )
+
+
+def _switch(
+    style: str, stand: Point, size: float, heading: float, upper: float, rng: np.random.Generator
+) -> MovablePart:
+    """A switch that turns about the vertical through `stand`.
+
+    Args:
+        style: "lever", "cross" or "knob".
+        stand: top of what it stands on.
+        size: how far it reaches from its axis.
+        heading: azimuth of a lever, from -x, rad.
+        upper: how far it turns, rad.
+        rng: draws the sense of turning.
+    """
+    hub = rod((0.0, 0.0, 0.005), (0.0, 0.0, 0.1), 0.07, 0.06)
+    if style == "lever":
+        arms = _arms(size, heading, 1)
+    elif style == "cross":
+        arms = _arms(0.7 * size, heading + np.pi / 4, 4)
+    else:
+        grips = _arms(0.45 * size, heading + np.pi / 5, 5)
+        arms = (rod((0.0, 0.0, 0.1), (0.0, 0.0, 0.2), 0.35 * size, sides=20), *moved(grips, (0.0, 0.0, 0.02)))
+    axis = TOP if rng.random() < 0.5 else BOTTOM
+    return MovablePart("switch", "revolute", moved((hub, *arms), stand), stand, axis, upper)
+
+
+def _arms(length: float, heading: float, count: int) -> Pieces:
+    """`count` arms spread evenly about the z axis, rising a little, the first at azimuth `heading` from -x."""
+    angles = heading + 2 * np.pi * np.arange(count) / count
+    return tuple(
+        rod((0.0, 0.0, 0.09), (-length * float(np.cos(a)), -length * float(np.sin(a)), 0.13), 0.035, 0.03, sides=10)
+        for a in angles
+    )

@@ -1,0 +1,1 @@
+"""SAPIEN: the scene, grippers, primitives and cameras."""

@@ -1,0 +1,195 @@
+"""Depth cameras: what of an articulated object can be seen from one place, and the cloud that is kept of it."""
+
+from dataclasses import dataclass
+from typing import Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+from numpy.typing import NDArray
+
+from collector.objects.articulation import ArticulatedObject, Body
+from shared.config import CameraConfig
+from shared.observation import furthest_first, round_normals, round_points
+from shared.types import Float, Observation
+
+NEAR, FAR = 0.1, 100.0
+"""Published clipping distances."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthImage:
+    """The pixels of one image that see the object.
+
+    Attributes:
+        pixels: [H], row * image width + column.
+        depths: [H], distance along the camera's forward axis.
+        points: [H, 3], world.
+        normals: [H, 3], world, unit, facing the camera.
+        bodies: [H], 0 for the root, k for the k-th part.
+    """
+
+    pixels: NDArray[np.uint32]
+    depths: Float
+    points: Float
+    normals: Float
+    bodies: NDArray[np.uint8]
+
+
+class Camera(Protocol):
+    """Anything that takes depth images of one object from one place."""
+
+    world_from_camera: Float
+    """[4, 4], x forward, y left, z up."""
+
+    def capture(self, joint_positions: Float) -> DepthImage:
+        """The image with the parts at `joint_positions`, [parts]."""
+        ...
+
+
+class EmbreeCamera:
+    """Casts one ray a pixel on the CPU; needs no graphics driver.
+
+    Each body has a scene of its own, in its own frame, which is built once for all states and cameras: the rays are
+    moved instead of the body, and the nearest hit of all bodies counts.
+
+    Args:
+        target: the object.
+        world_from_camera: [4, 4].
+        config: image size and field of view.
+    """
+
+    def __init__(self, target: ArticulatedObject, world_from_camera: Float, config: CameraConfig) -> None:
+        self.world_from_camera = world_from_camera
+        self._object = target
+        self._size = config.image_size
+        self._focal = config.image_size / 2 / np.tan(np.deg2rad(config.field_of_view_deg) / 2)
+        if target not in _SCENES:
+            _SCENES[target] = tuple(_BodyScene(body) for body in target.bodies)
+        self._bodies = _SCENES[target]
+
+    def capture(self, joint_positions: Float) -> DepthImage:
+        """The image with the parts at `joint_positions`, [parts]."""
+        depths = np.full(self._size**2, FAR)
+        normals = np.zeros((self._size**2, 3))
+        bodies = np.zeros(self._size**2, dtype=np.uint8)
+        for number, (body, world_from_body) in enumerate(
+            zip(self._bodies, self._object.body_poses(joint_positions), strict=True)
+        ):
+            body_from_camera = np.linalg.inv(world_from_body) @ self.world_from_camera
+            pixels = self._pixels_around(body.vertices, body_from_camera)
+            if len(pixels) == 0:
+                continue
+            depth, normal = body.cast(body_from_camera[:3, 3], self._directions(pixels) @ body_from_camera[:3, :3].T)
+            nearer = (depth > NEAR) & (depth < depths[pixels])
+            pixels = pixels[nearer]
+            depths[pixels], bodies[pixels] = depth[nearer], number
+            normals[pixels] = normal[nearer] @ world_from_body[:3, :3].T
+        seen = np.flatnonzero(depths < FAR).astype(np.uint32)
+        depths, normals = depths[seen], normals[seen]
+        directions = self._directions(seen) @ self.world_from_camera[:3, :3].T
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        normals *= -np.sign((normals * directions).sum(axis=1, keepdims=True))
+        return DepthImage(
+            pixels=seen,
+            depths=depths,
+            points=self.world_from_camera[:3, 3] + directions * depths[:, None],
+            normals=normals,
+            bodies=bodies[seen],
+        )
+
+    def _pixels_around(self, vertices: Float, body_from_camera: Float) -> NDArray[np.uint32]:
+        """Pixels inside the rectangle that holds the projections of all `vertices`, [V, 3], body frame."""
+        if len(vertices) == 0:
+            return np.zeros(0, dtype=np.uint32)
+        seen = (vertices - body_from_camera[:3, 3]) @ body_from_camera[:3, :3]
+        ahead = np.maximum(seen[:, :1], NEAR)
+        places = self._size / 2 - self._focal * seen[:, 1:] / ahead  # Columns grow to the right, rows downwards.
+        low = np.clip(np.floor(places.min(axis=0)), 0, self._size).astype(int)
+        high = np.clip(np.ceil(places.max(axis=0)), 0, self._size).astype(int)
+        columns, rows = np.arange(low[0], high[0]), np.arange(low[1], high[1])
+        return (rows[:, None] * self._size + columns[None, :]).ravel().astype(np.uint32)
+
+    def _directions(self, pixels: NDArray[np.uint32]) -> Float:
+        """Ray directions [P, 3], camera frame, through pixel centres, of length 1 along the camera's forward axis."""
+        rows, columns = np.divmod(pixels.astype(np.int64), self._size)
+        left = (self._size / 2 - columns - 0.5) / self._focal
+        up = (self._size / 2 - rows - 0.5) / self._focal
+        return np.stack([np.ones_like(left), left, up], axis=1)
+
+
+class _BodyScene:
+    """What is visible of one body, in its own frame.
+
+    Attributes:
+        vertices: [V, 3], body frame; none where the body has no triangles.
+    """
+
+    def __init__(self, body: Body) -> None:
+        vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int32)], 0
+        for mesh in body.visuals:
+            vertices.append(mesh.vertices)
+            faces.append(mesh.faces + count)
+            count += len(mesh.vertices)
+        triangles = np.concatenate(faces)
+        self.vertices = np.concatenate(vertices) if len(triangles) else np.zeros((0, 3))
+        self._scene = rtcore_scene.EmbreeScene()
+        if len(triangles):
+            TriangleMesh(self._scene, self.vertices.astype(np.float32), triangles.astype(np.int32))
+
+    def cast(self, origin: Float, directions: Float) -> tuple[Float, Float]:
+        """Cast rays from one place.
+
+        Args:
+            origin: [3], body frame.
+            directions: [P, 3], body frame.
+
+        Returns:
+            Depths [P], in lengths of the directions, infinite where nothing is hit; and normals [P, 3], body frame, of
+            any length and to either side.
+        """
+        origins = np.broadcast_to(origin, directions.shape)
+        hits = self._scene.run(
+            np.ascontiguousarray(origins, dtype=np.float32),
+            np.ascontiguousarray(directions, dtype=np.float32),
+            output=True,
+            dists=None,
+        )
+        depths = np.where(hits["geomID"] >= 0, hits["tfar"].astype(np.float64), np.inf)
+        return depths, hits["Ng"].astype(np.float64)
+
+
+_SCENES: WeakKeyDictionary[ArticulatedObject, tuple[_BodyScene, ...]] = WeakKeyDictionary()
+"""Of the objects that somebody still holds."""
+
+
+def observation_from(
+    image: DepthImage,
+    world_from_camera: Float,
+    qualifying: tuple[int, ...],
+    config: CameraConfig,
+    rng: np.random.Generator,
+) -> Observation | None:
+    """The cloud that is kept of an image, in furthest-point order; None where no pixel sees the object.
+
+    Args:
+        image: what the camera saw.
+        world_from_camera: [4, 4], where it stood.
+        qualifying: parts (1-based) that the task may act on.
+        config: how many points to keep, and of how many candidates.
+        rng: draws the candidates.
+    """
+    if len(image.pixels) == 0:
+        return None
+    # A small object fills few pixels: then every one is kept, and some stand twice.
+    kept = furthest_first(image.points, config.points, config.candidates, rng)
+    bodies = image.bodies[kept]
+    return Observation(
+        points=round_points(image.points[kept]),
+        normals=round_normals(image.normals[kept]),
+        part_ids=bodies,
+        movable=np.isin(bodies, np.array(qualifying, dtype=np.uint8)),
+        pixels=image.pixels[kept],
+        world_from_camera=world_from_camera,
+    )

@@ -1,0 +1,276 @@
+"""One object and the flying hand in SAPIEN's CPU physics: hidden dynamics, states, contacts.
+
+A scene is built for one rollout, always in the same order, so that a rollout gives the same bits whichever worker runs
+it. At rest, the positions of the joints are the whole state of the object.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from collector.objects.articulation import ArticulatedObject, Joint
+from collector.sim.engine import Assembly, Link, new_scene, physx, pose, sapien, set_mass
+from collector.sim.grippers import GRIPPERS
+from shared.config import PANDA, Fidelity, Timing
+from shared.hidden import HIDDEN_PARAMETERS
+from shared.primitives import PrimitiveSpec
+from shared.types import Direction, Float, HiddenDynamics
+
+RESTITUTION = 0.01
+FRICTION_DAMPING = 1e5
+"""Damping of the force-limited drive that stands for Coulomb friction: below its limit a joint creeps by at most
+limit / damping a second."""
+CONTACT_FORCE = 5.0
+"""N. The published rule counts contact points with a squared impulse above 1e-4; at its 1/500 s that is this force."""
+CONTACT_RANGE = 0.02
+"""The engine lists pairs that are closer than this: the sum of two shapes' contact offsets."""
+TOUCHING = 1e-3
+"""Pairs further apart exert no force: until it touches something, the hand moves by a tenth of this a step. (Each force
+that is read costs as much as the rest of its pair.)"""
+FORGETTING_STEPS = 1
+"""Steps with the hand out of reach, after which the engine holds no contact of the trial before."""
+PARKED = np.array([0.0, 0.0, 50.0])
+"""Where the hand waits while the object settles, out of reach of everything."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """What the hand touches at this moment, by forces that the published rule counts.
+
+    Attributes:
+        finger_on: bodies (0 the root, k the k-th part) that a finger presses on.
+        palm: whether the palm presses on anything.
+        brushes: whether the hand touches anything at all, however lightly.
+        clearance: how far the hand is from the object at least, as far as the engine looks.
+    """
+
+    finger_on: frozenset[int]
+    palm: bool
+    brushes: bool
+    clearance: float
+
+    @property
+    def presses(self) -> bool:
+        """Whether the hand presses on anything."""
+        return self.palm or bool(self.finger_on)
+
+
+class Scene:
+    """The simulated world of one rollout.
+
+    Args:
+        target: the object.
+        dynamics: the hidden draw, applied to every movable part by the records of its parameters.
+        fidelity: time step, solver iterations, and how the hand flies.
+        primitive: what will be executed.
+        gripper: the name of the hand.
+
+    Attributes:
+        system: SAPIEN's physics system; `system.step()` advances time.
+        gripper: the flying hand.
+    """
+
+    def __init__(
+        self,
+        target: ArticulatedObject,
+        dynamics: HiddenDynamics,
+        fidelity: Fidelity,
+        primitive: PrimitiveSpec,
+        gripper: str = PANDA,
+    ) -> None:
+        self.object = target
+        self.dynamics = dynamics
+        iterations = fidelity.solver_iterations if primitive.needs_friction else fidelity.push_solver_iterations
+        self._scene, self.system = new_scene(iterations)
+        self._material = physx.PhysxMaterial(0.0, 0.0, RESTITUTION)
+        self._articulation, self._links = _add_object(self._scene, target, self._material)
+        joints = {joint.name: joint for joint in self._articulation.active_joints}
+        self._joints = [joints[_joint_name(k)] for k in range(1, len(self._links))]
+        names = [joint.name for joint in self._articulation.active_joints]
+        self._order = np.array([names.index(joint.name) for joint in self._joints], dtype=np.int64)
+        self._bodies = {link: k for k, link in enumerate(self._links)}
+        for name, value in dynamics.values.items():
+            HIDDEN_PARAMETERS.get(name).apply(self, value)
+        self.gripper = GRIPPERS.get(gripper).build(self._scene, self._material, fidelity.jointed_hand)
+        self._hand = {self.gripper.palm, *self.gripper.fingers}
+        self._fidelity = fidelity
+        self._impulse_squared = 0.0
+        self.limits = target.limits()
+        self.park()
+
+    @property
+    def links(self) -> list[Link]:
+        """SAPIEN's links of the movable parts, in part order."""
+        return self._links[1:]
+
+    @property
+    def joints(self) -> list[physx.PhysxArticulationJoint]:
+        """SAPIEN's joints of the movable parts, in part order."""
+        return self._joints
+
+    def set_part_mass(self, mass: float) -> None:
+        """Give every movable part this mass, kg; its inertia is scaled along."""
+        for link in self.links:
+            set_mass(link, mass)
+
+    def set_joint_friction(self, limit: float) -> None:
+        """Give every movable joint this Coulomb friction: N m if it turns, N if it slides."""
+        for joint in self.joints:
+            joint.set_drive_property(0.0, FRICTION_DAMPING, force_limit=limit)
+
+    def set_surface_friction(self, coefficient: float) -> None:
+        """Give the surfaces of hand and object this friction coefficient, static and dynamic."""
+        self._material.static_friction = self._material.dynamic_friction = coefficient
+
+    def set_timing(self, timing: Timing) -> None:
+        """Step time, and move the hand, as `timing` says from now on."""
+        self.system.set_timestep(1.0 / timing.steps_per_second)
+        self._impulse_squared = (CONTACT_FORCE / timing.steps_per_second) ** 2
+        self.gripper.set_pace(timing.pace)
+
+    def park(self) -> None:
+        """Take the hand out of reach, and step time as before any trial."""
+        self.set_timing(self._fidelity.approach)
+        self.gripper.place(np.eye(3), PARKED, opened=False)
+
+    def joint_positions(self) -> Float:
+        """[parts], in part order."""
+        return np.asarray(self._articulation.get_qpos(), dtype=np.float64)[self._order]
+
+    def coordinates(self) -> Float:
+        """Everything that moves: the joint positions of the object, then the coordinates of the hand."""
+        return np.concatenate([self._articulation.get_qpos(), self.gripper.coordinates()])
+
+    def put(self, positions: Float) -> None:
+        """Put the object at rest with its joints at `positions`, [parts], and the hand out of reach.
+
+        One step is taken in between, so that the engine forgets the contacts of the trial before: a trial then comes
+        out the same after any other, and alone.
+        """
+        self.park()
+        for _ in range(FORGETTING_STEPS):
+            self._set_joint_positions(positions)
+            self.system.step()
+        self._set_joint_positions(positions)
+        self.park()
+
+    def _set_joint_positions(self, positions: Float) -> None:
+        packed = np.zeros(len(positions), dtype=np.float32)
+        packed[self._order] = positions
+        self._articulation.set_qpos(packed)
+        self._articulation.set_qvel(np.zeros_like(packed))
+
+    def restrict(self, positions: Float) -> None:
+        """Apply the hidden direction mode: which ways joints turn from `positions`, [parts].
+
+        The range of travel is that of the joint's own limits; as built, nothing changes.
+        """
+        self.limits = restricted_limits(self.object.limits(), positions, self.dynamics.direction)
+        for joint, (low, high) in zip(self._joints, self.limits, strict=True):
+            joint.set_limits(np.array([[low, high]], dtype=np.float32))
+
+    def body_pose(self, body: int) -> Float:
+        """world_from_body, [4, 4], of the root (0) or a part."""
+        return np.asarray(self._links[body].entity_pose.to_transformation_matrix(), dtype=np.float64)
+
+    def settle(self, still_steps: int, most_steps: int) -> bool:
+        """Let the object come to rest with the hand parked.
+
+        Returns:
+            Whether it did: every joint moved less than 1e-6 a step and nothing pressed on anything for `still_steps`
+            steps on end, within `most_steps`.
+        """
+        self.park()
+        before, still = self.joint_positions(), 0
+        for _ in range(most_steps):
+            self.system.step()
+            now = self.joint_positions()
+            moved = np.abs(now - before).max(initial=0.0) >= 1e-6
+            still = 0 if moved or (still % 16 == 0 and self._presses()) else still + 1
+            before = now
+            if still >= still_steps:
+                return bool(np.isfinite(now).all())
+        return False
+
+    def contact(self) -> Contact:
+        """What the hand touches after the last step."""
+        finger_on, palm, brushes, clearance = set(), False, False, CONTACT_RANGE
+        for contact in self.system.get_contacts():
+            first, second = contact.bodies
+            if (first in self._hand) == (second in self._hand):
+                continue
+            strongest = 0.0
+            for point in contact.points:
+                separation = point.separation
+                clearance = min(clearance, separation)
+                if separation < TOUCHING:
+                    strongest = max(strongest, float(point.impulse @ point.impulse))
+            brushes = brushes or strongest > 0.0
+            if strongest <= self._impulse_squared:
+                continue
+            hand, other = (first, second) if first in self._hand else (second, first)
+            if hand == self.gripper.palm:
+                palm = True
+            else:
+                finger_on.add(self._bodies[other])
+        return Contact(frozenset(finger_on), palm, brushes, clearance)
+
+    def _presses(self) -> bool:
+        """Whether anything presses on anything."""
+        return any(self._counts(contact) for contact in self.system.get_contacts())
+
+    def _counts(self, contact: physx.PhysxContact) -> bool:
+        return any(float(p.impulse @ p.impulse) > self._impulse_squared for p in contact.points)
+
+
+def restricted_limits(limits: Float, positions: Float, direction: Direction) -> Float:
+    """Joint limits [parts, 2] under a direction mode, from where the joints stand ([parts]).
+
+    Seen along the joint's axis, clockwise is towards greater positions.
+    """
+    if direction is Direction.AS_BUILT:
+        return limits
+    travel = limits[:, 1] - limits[:, 0]
+    low = positions - (0.0 if direction is Direction.CLOCKWISE else travel)
+    high = positions + (0.0 if direction is Direction.COUNTER_CLOCKWISE else travel)
+    return np.stack([low, high], axis=1)
+
+
+def _joint_name(part: int) -> str:
+    """Names within the scene; those of the URDF need not be unique across merged links."""
+    return f"part-{part}"
+
+
+def _add_object(
+    scene: sapien.Scene, target: ArticulatedObject, material: physx.PhysxMaterial
+) -> tuple[physx.PhysxArticulation, list[Link]]:
+    """The object, its root fixed at the origin; returns its links in body order."""
+    assembly = Assembly(material)
+    assembly.add(None, "root", target.bodies[0].collisions)
+    for k, body in enumerate(target.parts, start=1):
+        joint = body.joint
+        assert joint is not None
+        along = _joint_frame(joint)
+        assembly.add(
+            assembly.links[joint.parent],
+            f"part-{k}",
+            body.collisions,
+            joint=joint.kind,
+            joint_name=_joint_name(k),
+            parent_from_joint=joint.parent_from_body @ along,
+            child_from_joint=along,
+            limits=(joint.lower, joint.upper),
+        )
+    articulation = assembly.finish(scene)
+    articulation.set_root_pose(pose(np.eye(4)))
+    return articulation, assembly.links
+
+
+def _joint_frame(joint: Joint) -> Float:
+    """A frame [4, 4] at the body's origin whose x is the joint's axis."""
+    helper = np.eye(3)[np.argmin(np.abs(joint.axis))]
+    second = np.cross(joint.axis, helper)
+    second /= np.linalg.norm(second)
+    frame = np.eye(4)
+    frame[:3, 0], frame[:3, 1], frame[:3, 2] = joint.axis, second, np.cross(joint.axis, second)
+    return frame

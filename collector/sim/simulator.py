@@ -1,0 +1,103 @@
+"""What a rollout needs of a simulator, whichever physics it computes, and the simulators that there are, by name."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from collector.objects.articulation import ArticulatedObject
+from collector.stopwatch import StageClock
+from shared.config import SAPIEN, CollectionConfig
+from shared.extensions import Registry
+from shared.tasks import Task
+from shared.types import Environment, Float, HiddenDynamics
+
+
+@dataclass(frozen=True, slots=True)
+class PrivilegedState:
+    """What a simulator knows of the present state and no camera sees.
+
+    Attributes:
+        joint_positions: [parts], rad or m, in part order.
+        joint_limits: [parts, 2], lower and upper, the hidden direction mode applied.
+        joint_twist: [6], (w, v) of the joint of one part, world (see `collector.objects.articulation.joint_twist`).
+    """
+
+    joint_positions: Float
+    joint_limits: Float
+    joint_twist: Float
+
+
+class SimEnvironment(Environment, Protocol):
+    """One object with its hidden dynamics before one camera, for one rollout.
+
+    The same arguments and the same calls give the same bits, in any process.
+
+    Attributes:
+        object: what is acted upon.
+        primitive: name of what `execute` executes.
+    """
+
+    object: ArticulatedObject
+    primitive: str
+
+    def reset(self, rng: np.random.Generator) -> bool:
+        """Draw a new start state and let it settle; whether it came to rest.
+
+        The first state fixes what the hidden direction mode allows, for good.
+        """
+        ...
+
+    def shows_a_target(self) -> bool:
+        """Whether the camera sees a point that the task may act on."""
+        ...
+
+    def state(self) -> Float:
+        """The present state, in a form of the simulator's own, which `restore` puts back."""
+        ...
+
+    def restore(self, state: Float) -> None:
+        """Put a state back, at rest."""
+        ...
+
+    def privileged(self, part: int) -> PrivilegedState:
+        """What the camera does not see; `part` (1-based) is the one whose twist is wanted."""
+        ...
+
+
+class MakeEnvironment(Protocol):
+    """Makes the environment of one rollout."""
+
+    def __call__(
+        self,
+        target: ArticulatedObject,
+        task: Task,
+        collection: CollectionConfig,
+        dynamics: HiddenDynamics,
+        world_from_camera: Float,
+        rng: np.random.Generator,
+        clock: StageClock,
+    ) -> SimEnvironment:
+        """See `collector.sim.environment.SapienEnvironment`."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Simulator:
+    """One simulator.
+
+    Attributes:
+        make: makes environments.
+    """
+
+    make: MakeEnvironment
+
+
+def _sapien(*args: Any, **named: Any) -> SimEnvironment:
+    # Loads the engine, which rollouts of other simulators do not need.
+    from collector.sim.environment import SapienEnvironment
+
+    return SapienEnvironment(*args, **named)
+
+
+SIMULATORS = Registry("simulator", Simulator, {SAPIEN: Simulator(_sapien)})

@@ -1,0 +1,211 @@
+"""The execution of a primitive: its legs, the first-contact rule and the success rule (published protocol)."""
+
+import numpy as np
+
+from collector.sim.gripper import still
+from collector.sim.scene import Scene
+from shared.config import Fidelity
+from shared.primitives import START_DISTANCE, Leg, PrimitiveSpec, hand_start
+from shared.types import Action, Float, Outcome, OutcomeKind
+
+MOTION_THRESHOLD = 0.01
+"""tau: rad or length."""
+MOTION_SHARE = 0.5
+"""Or this share of the joint's range, for joints whose range is small."""
+DIRECTION_COSINE = 0.5
+"""The touched point must move within 60 deg of where the primitive means to take it."""
+CLEARANCE = 3e-4
+"""Free flight ends this far before the object."""
+LEAST_SKIP = 4
+"""Steps of free flight; to skip fewer would cost more than to simulate them."""
+REST_STEPS, REST_MOTION = 8, 1.2e-5
+"""A hold may end when hand and object moved by less than the second a step over the first; at the time constant of the
+hand's drives (24 steps of the fast approach, 48 of its drag) less than 0.6 mm is then left to come."""
+SANE_POSITION = 1e3
+"""A joint position beyond this means that the simulation diverged."""
+
+
+def hand_pose(leg: Leg) -> Float:
+    """Where a leg ends, [4], as `collector.sim.gripper.Gripper` counts it."""
+    forward, left, up = leg.end
+    return np.array([forward, left, START_DISTANCE + up, leg.turn_rad])
+
+
+class _TrialEndedError(Exception):
+    """A trial is over before its trajectory is; never leaves this module."""
+
+    def __init__(self, kind: OutcomeKind) -> None:
+        super().__init__(kind)
+        self.kind = kind
+
+
+class Trial:
+    """One execution of a primitive in a scene.
+
+    Args:
+        scene: with the object in its start state.
+        action: p and R.
+        target: the part (1-based) that p lies on.
+        primitive: what to execute.
+        fidelity: how finely.
+    """
+
+    def __init__(self, scene: Scene, action: Action, target: int, primitive: PrimitiveSpec, fidelity: Fidelity) -> None:
+        self.scene = scene
+        self.action = action
+        self.target = target
+        self.primitive = primitive
+        self.fidelity = fidelity
+        self.steps = 0
+        self._checked = False
+        self._brushed = False
+        self._timing = fidelity.approach
+        self._clearance = 0.0
+        self._positions = np.full(1, np.nan)
+        self._hand_at = still()
+        self._opening = float("nan")
+
+    def run(self) -> Outcome:
+        """Execute the primitive and judge it; the scene is left as the trial leaves it, the hand parked."""
+        scene = self.scene
+        before = scene.joint_positions()
+        start = before[self.target - 1]
+        body_from_world = np.linalg.inv(scene.body_pose(self.target))
+        local = body_from_world @ np.append(self.action.point, 1.0)
+        scene.gripper.place(self.action.rotation, hand_start(self.action), opened=self.primitive.closes_fingers)
+        try:
+            self._execute()
+            kind = OutcomeKind.OK if self._brushed else OutcomeKind.NO_CONTACT
+        except _TrialEndedError as ended:
+            kind = ended.kind
+        if kind is OutcomeKind.START_COLLISION:
+            # A hand cannot be where something else is; what one step of overlap did to the object never happened.
+            scene.put(before)
+        end = scene.joint_positions()[self.target - 1]
+        displacement = (scene.body_pose(self.target) @ local)[:3] - self.action.point
+        scene.park()
+        if not np.isfinite(scene.joint_positions()).all() or np.abs(scene.joint_positions()).max() > SANE_POSITION:
+            return Outcome(OutcomeKind.UNSTABLE, 0.0, False, float(start), steps=self.steps)
+        valid = kind in (OutcomeKind.OK, OutcomeKind.NO_CONTACT)
+        return Outcome(
+            kind=kind,
+            motion=float(abs(end - start)) if valid else 0.0,
+            success=valid and self._succeeded(start, end, displacement),
+            start_joint_position=float(start),
+            end_joint_position=float(end),
+            displacement=displacement,
+            grasp_opening=self._opening,
+            steps=self.steps,
+        )
+
+    def _execute(self) -> None:
+        gripper, then = self.scene.gripper, self.primitive.then
+        self._leg(hand_pose(self.primitive.approach))
+        self._hold(last=then is None)
+        if self.primitive.closes_fingers:
+            gripper.close()
+            self._hold(closing=True)
+            self._opening = gripper.opening()
+            if not gripper.holds():
+                raise _TrialEndedError(OutcomeKind.NO_GRASP)
+        if then is not None:
+            self._timing = self.fidelity.drag
+            self.scene.set_timing(self._timing)
+            self._leg(hand_pose(then))
+            self._hold(last=True)
+
+    def _leg(self, end: Float) -> None:
+        """Drive the hand to `end`, [4], at constant speed."""
+        gripper, steps = self.scene.gripper, self._timing.leg_steps
+        path = np.linspace(self._hand_at, end, steps + 1)
+        velocity = (end - self._hand_at) * (self._timing.steps_per_second / steps)
+        gripper.drive_velocity(velocity)
+        step = 0
+        while step < steps:
+            step += 1
+            gripper.drive(path[step])
+            self._step()
+            if self.fidelity.skip_free_flight and (skipped := self._free_flight(path, step)):
+                step += skipped
+                gripper.shift(path[step], velocity)
+        gripper.drive(end)
+        gripper.drive_velocity(still())
+        self._hand_at = end
+
+    def _free_flight(self, path: Float, step: int) -> int:
+        """How many steps after `step` of the leg along `path`, [steps + 1, 4], will touch and move nothing.
+
+        These need not be simulated. The hand is put ahead by no more than its clearance, so that it cannot pass through
+        anything, and only while the object rests: before the first contact, or once the hand has let go of it.
+        """
+        if self._checked:
+            if step % REST_STEPS or not self._object_rests():
+                return 0
+            self._clearance = self.scene.contact().clearance
+        stride = float(np.linalg.norm(path[1, :3] - path[0, :3]))
+        # A hand that turns may come nearer than its way tells.
+        if self._clearance <= CLEARANCE or stride == 0 or path[0, 3] != path[-1, 3]:
+            return 0
+        lag = float(np.linalg.norm(path[step, :3] - self.scene.gripper.displacement()))
+        ahead = min(int((self._clearance - CLEARANCE - lag) / stride), len(path) - 1 - step)
+        return ahead if ahead >= LEAST_SKIP else 0
+
+    def _object_rests(self) -> bool:
+        """Whether no joint has moved since this was asked last, `REST_STEPS` ago or more."""
+        before, self._positions = self._positions, self.scene.joint_positions()
+        return bool(np.abs(self._positions - before).max() < REST_STEPS * REST_MOTION)
+
+    def _hold(self, closing: bool = False, last: bool = False) -> None:
+        """Keep all drive targets for a while.
+
+        Args:
+            closing: the fingers close; once they hold nothing, all is said.
+            last: nothing comes after this hold, so that a hand which has let go of a resting object may move on.
+        """
+        before = np.zeros(0)
+        for step in range(self._timing.hold_steps):
+            self._step()
+            if not self.fidelity.end_holds_at_rest or step % REST_STEPS:
+                continue
+            if closing and not self.scene.gripper.holds():
+                return
+            now = self.scene.coordinates()
+            if step and np.abs(now - before).max() < REST_STEPS * REST_MOTION:
+                return
+            if last and self._object_rests() and self.scene.contact().clearance > CLEARANCE:
+                return
+            before = now
+
+    def _step(self) -> None:
+        self.scene.system.step()
+        self.steps += 1
+        if not self._checked:
+            self._check_first_contact()
+
+    def _check_first_contact(self) -> None:
+        """The published first-contact rule; checking ends with the first valid contact.
+
+        Where the rule does not hold, only the first step can go wrong, so that a touch ends the checking.
+        """
+        contact = self.scene.contact()
+        self._brushed = self._brushed or contact.brushes
+        self._clearance = contact.clearance
+        if contact.presses:
+            if self.steps == 1:
+                raise _TrialEndedError(OutcomeKind.START_COLLISION)
+            if self.primitive.checks_contact and contact.palm:
+                raise _TrialEndedError(OutcomeKind.HAND_CONTACT)
+            if self.primitive.checks_contact and contact.finger_on - {self.target}:
+                raise _TrialEndedError(OutcomeKind.WRONG_PART)
+        self._checked = contact.presses or (not self.primitive.checks_contact and contact.brushes)
+
+    def _succeeded(self, start: float, end: float, displacement: Float) -> bool:
+        low, high = self.scene.limits[self.target - 1]
+        motion = abs(end - start)
+        if not (motion > MOTION_THRESHOLD or motion > MOTION_SHARE * (high - low)):
+            return False
+        intended = self.primitive.intended
+        if intended is None:
+            return True
+        length = float(np.linalg.norm(displacement))
+        return length > 0 and float(displacement @ (self.action.rotation @ intended)) > DIRECTION_COSINE * length

@@ -1,0 +1,1 @@
+"""A store as arrays, and the batches that training takes from them."""

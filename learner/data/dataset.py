@@ -1,0 +1,326 @@
+"""A store as compact arrays: every cloud once, its neighbour indices once, and rows grouped by rollout.
+
+Shapes: O clouds, N points, I interactions.
+"""
+
+import zlib
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from learner.data.privileged import HiddenColumns, facts_of
+from learner.training.hardware import moved
+from shared.config import DynamicsRanges
+from shared.errors import StoreError, UsageError
+from shared.geometry import view_from_world
+from shared.io.files import read_named
+from shared.networks.actions import middle_of
+from shared.networks.grouping import group_cloud
+from shared.networks.network_config import NetworkConfig
+from shared.networks.pointnet2 import CloudBatch
+from shared.store.codecs.columns import LIST, Column, hidden_names, interaction_columns
+from shared.store.codecs.tables import column_values
+from shared.store.layout import MAX_ROWS
+from shared.store.store import Store
+from shared.types import Float, Float32, Order, OutcomeKind
+
+COLUMNS = (
+    *("plan_key", "rollout", "object_id", "step"),
+    *("point_index", "rotation", "order", "role", "policy_version", "method", "budget", "target_part"),
+    *("joint_positions", "joint_limits", "joint_twist", "outcome", "motion", "success"),
+)
+MAX_LIST_BYTES = 1 << 20
+VALIDATION_SHARE = 5
+"""Without lists of objects, one object in this many is kept for validation, chosen by a hash of its id."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Interactions, one an entry; vectors in the view frame of their cloud.
+
+    Attributes:
+        cloud: [I], index of the cloud.
+        point: [I], index of p in it.
+        xyz: p less the middle of what may be moved, [I, 3].
+        frame: approach and forward, [I, 6].
+        motion: m, [I].
+        success: r as 0 or 1, [I].
+        step: [I], number within the rollout.
+        continued: [I], whether the row began where the one before it left the object.
+        facts: [I, facts], for the oracle only (see `learner.data.privileged`).
+        role, method: [I], names (see `shared.records.InteractionRecord`).
+        budget: [I].
+    """
+
+    cloud: Tensor
+    point: Tensor
+    xyz: Tensor
+    frame: Tensor
+    motion: Tensor
+    success: Tensor
+    step: Tensor
+    continued: Tensor
+    facts: Tensor
+    role: NDArray[np.str_]
+    method: NDArray[np.str_]
+    budget: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.cloud)
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """A store's interactions.
+
+    Attributes:
+        task: of the store.
+        clouds: every cloud once, with its neighbour indices, view frame.
+        movable: [O, N].
+        middles: of the movable points, [O, 3].
+        rows: labels only; rows of failed infrastructure are left out.
+        rollouts: for each rollout, its rows in order of step.
+        objects: for each rollout, its object's id.
+        versions: for each rollout, the version of the policy that proposed in it; 0 is none.
+    """
+
+    task: str
+    clouds: CloudBatch
+    movable: Tensor
+    middles: Tensor
+    rows: Rows
+    rollouts: tuple[Tensor, ...]
+    objects: tuple[str, ...]
+    versions: tuple[int, ...]
+
+    def on(self, device: torch.device) -> "Dataset":
+        """The same on a device; the numbers of the rollouts' rows stay, since batches are drawn on the CPU."""
+        return self if device.type == "cpu" else replace(moved(self, device), rollouts=self.rollouts)
+
+    def rollouts_of(self, objects: Collection[str]) -> tuple[int, ...]:
+        """Numbers of the rollouts of some objects."""
+        return tuple(number for number, name in enumerate(self.objects) if name in objects)
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Rollouts to learn from, and rollouts of other objects to judge by."""
+
+    train: tuple[int, ...]
+    validation: tuple[int, ...]
+
+
+def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
+    """Load all labels of a store.
+
+    Raises:
+        StoreError: the store is damaged, or holds no label at all.
+    """
+    ranges = store.setting.dynamics
+    known = {column.name: column for column in interaction_columns(ranges.added)}
+    hidden = hidden_names(ranges.added)
+    names = (*COLUMNS, *hidden.values(), "observation")
+    table = store.interactions(names)
+    labels = pa.array([kind.value for kind in OutcomeKind if kind.is_label], pa.string())
+    table = table.filter(pc.is_in(table.column("outcome"), value_set=labels))
+    if not len(table):
+        raise StoreError(f"{store.where}: holds no interaction to learn from; collect some first")
+    cells = {name: _cells(table, known[name]) for name in names}
+    shards, shard = _coded(table, "shard")
+    seen, cloud = np.unique(shard * MAX_ROWS + cells["observation"], return_inverse=True)
+    places = ((shards[number // MAX_ROWS], int(number % MAX_ROWS)) for number in seen)
+    points, movable, views = _read_clouds(store, places, len(seen))
+    batch = CloudBatch.of(points, (group_cloud(each, config) for each in points))
+    masks = torch.from_numpy(movable)
+    middles = middle_of(batch.points, masks)
+    dynamics = {name: cells[column] for name, column in hidden.items()}
+    rows = _rows(cells, dynamics, ranges, cloud, batch.points, views, middles)
+    order, starts = _by_rollout(table, cells)
+    objects, of_object = _coded(table, "object_id")
+    return Dataset(
+        task=store.setting.task,
+        clouds=batch,
+        movable=masks,
+        middles=middles,
+        rows=rows,
+        rollouts=torch.from_numpy(order).tensor_split(torch.from_numpy(starts[1:])),
+        objects=tuple(objects[number] for number in of_object[order[starts]]),
+        versions=tuple(np.maximum.reduceat(cells["policy_version"][order], starts).tolist()),
+    )
+
+
+def split(dataset: Dataset, train: Collection[str] | None, validation: Collection[str] | None) -> Split:
+    """Split a data set's rollouts by object.
+
+    Args:
+        dataset: the interactions.
+        train: ids of the objects to learn from; None: all but those for validation.
+        validation: ids of the objects to judge by; None: all but those for training, or, where these are not given
+            either, one object in five, by a hash of its id.
+
+    Raises:
+        UsageError: an object is in both, or one of the two has no rollout.
+    """
+    leaked = sorted(set(train or ()) & set(validation or ()))
+    if leaked:
+        raise UsageError(f"object '{leaked[0]}' is listed for training and for validation; list each object once")
+    if validation is None:
+        validation = set(dataset.objects) - set(train) if train is not None else kept_for_validation(dataset.objects)
+    if train is None:
+        train = set(dataset.objects) - set(validation)
+    parts = Split(dataset.rollouts_of(train), dataset.rollouts_of(validation))
+    for name, found in (("training", parts.train), ("validation", parts.validation)):
+        if not found:
+            raise UsageError(f"no rollout of the store is of an object for {name}; collect or list more objects")
+    return parts
+
+
+def kept_for_validation(objects: Iterable[str]) -> frozenset[str]:
+    """One object in five, by a hash of its id, and at least one."""
+    # A rank, instead of a remainder of the hash, never comes out empty for few objects.
+    ranked = sorted(set(objects), key=lambda name: (zlib.crc32(name.encode()), name))
+    return frozenset(ranked[: max(1, len(ranked) // VALIDATION_SHARE)])
+
+
+def without_later(dataset: Dataset, parts: Split, newest: int) -> Split:
+    """The split without what policies later than `newest` proposed to learn from; what is judged by stays.
+
+    Raises:
+        UsageError: nothing is left.
+    """
+    train = tuple(number for number in parts.train if dataset.versions[number] <= newest)
+    if not train:
+        raise UsageError(f"no rollout to learn from is of policy {newest} or older; collect some at random first")
+    return Split(train, parts.validation)
+
+
+def read_object_list(path: Path | None) -> frozenset[str] | None:
+    """Object ids, one a line; what follows a blank (such as Where2Act's category) is ignored.
+
+    Raises:
+        UsageError: the file is missing, too large, not text, or lists nothing.
+    """
+    if path is None:
+        return None
+    advice = "name a text file with one object id a line"
+    try:
+        lines = read_named(path, MAX_LIST_BYTES, advice).decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise UsageError(f"{path}: not text; {advice}") from None
+    names = frozenset(line.split()[0] for line in lines if line.split())
+    if not names:
+        raise UsageError(f"{path}: lists no object; write one object id a line")
+    return names
+
+
+def _cells(table: Any, column: Column[Any]) -> Any:
+    """A column as an array; lists of any length as their numbers, their lengths, and where each begins."""
+    if not column.dtype:
+        names, codes = _coded(table, column.name)
+        return np.array(names)[codes]
+    if column.width != LIST:
+        return column_values(table, column)
+    lists = table.column(column.name).combine_chunks()
+    lengths = pc.list_value_length(lists).to_numpy().astype(np.int64)
+    return lists.flatten().to_numpy(), lengths, np.cumsum(lengths) - lengths
+
+
+def _coded(table: Any, name: str) -> tuple[list[str], NDArray[np.int64]]:
+    """The different texts of a column, in order, and the number of each row's."""
+    encoded = table.column(name).combine_chunks().dictionary_encode()
+    texts = encoded.dictionary.to_pylist()
+    order = sorted(range(len(texts)), key=texts.__getitem__)
+    ranks = np.empty(len(texts), np.int64)
+    ranks[order] = np.arange(len(texts))
+    return [texts[number] for number in order], ranks[encoded.indices.to_numpy()]
+
+
+def _read_clouds(
+    store: Store, names: Iterable[tuple[str, int]], count: int
+) -> tuple[Float32, NDArray[np.bool_], NDArray[np.float64]]:
+    """Clouds by shard and index: points in the view frame, movable masks, and the turn from world to view [O, 3, 3]."""
+    size = store.setting.collection.camera.points
+    # Filled one by one, since a list of so many arrays would be in memory beside what they are stacked into.
+    points = np.empty((count, size, 3), np.float32)
+    movable, views = np.empty((count, size), np.bool_), np.empty((count, 3, 3))
+    shard, arrays = "", None
+    for number, (name, index) in enumerate(names):
+        if arrays is None or name != shard:
+            shard, arrays = name, store.read_observations(name)
+        if not 0 <= index < len(arrays) or arrays.points.shape[1] != size:
+            raise StoreError(f"{store.where}: shard {name} has no observation {index}; it is damaged")
+        views[number] = view_from_world(arrays.world_from_camera[index])
+        points[number] = arrays.points[index] @ views[number].T.astype(np.float32)
+        movable[number] = arrays.movable[index]
+    return points, movable, views
+
+
+def _rows(
+    cells: dict[str, Any],
+    dynamics: dict[str, Float],
+    ranges: DynamicsRanges,
+    cloud: NDArray[np.int64],
+    points: Tensor,
+    views: NDArray[np.float64],
+    middles: Tensor,
+) -> Rows:
+    view = views[cloud]
+    rotation = cells["rotation"].reshape(-1, 3, 3)
+    turned = np.einsum("iab,ibc->iac", view, rotation)
+    frame = np.concatenate([turned[:, :, 2], turned[:, :, 0]], axis=1)
+    point = cells["point_index"].astype(np.int64)
+    if point.min() < 0 or point.max() >= points.shape[1]:
+        raise StoreError("the store names a point that its cloud does not have; run `adaafford store verify`")
+    hidden = HiddenColumns(
+        twist=cells["joint_twist"].reshape(-1, 6),
+        room=_room(cells),
+        dynamics=dynamics,
+        ranges=ranges,
+        view=view,
+        middle=middles.double().numpy()[cloud],
+    )
+    numbers = [cells["motion"], rotation, cells["joint_twist"]]
+    facts = facts_of(hidden).astype(np.float32)
+    if not all(np.isfinite(each.astype(np.float32)).all() for each in (*numbers, facts)):
+        raise StoreError("the store holds numbers that are not finite; run `adaafford store verify`")
+    return Rows(
+        cloud=torch.from_numpy(cloud),
+        point=torch.from_numpy(point),
+        xyz=(points[torch.from_numpy(cloud), torch.from_numpy(point)] - middles[torch.from_numpy(cloud)]),
+        frame=torch.from_numpy(frame.astype(np.float32)),
+        motion=torch.from_numpy(cells["motion"].astype(np.float32)),
+        success=torch.from_numpy(cells["success"].astype(np.float32)),
+        step=torch.from_numpy(cells["step"].astype(np.int64)),
+        continued=torch.from_numpy(cells["order"] == Order.CONTINUE.value),
+        facts=torch.from_numpy(facts),
+        role=cells["role"],
+        method=cells["method"],
+        budget=cells["budget"].astype(np.int64),
+    )
+
+
+def _room(cells: dict[str, Any]) -> NDArray[np.float64]:
+    """How far each row's target joint can go up and down from where it starts, [I, 2]."""
+    (positions, joints, first), (limits, bounds, first_limit) = cells["joint_positions"], cells["joint_limits"]
+    part = cells["target_part"].astype(np.int64)
+    room = np.zeros((len(part), 2))
+    row = np.flatnonzero((part >= 1) & (part <= np.minimum(joints, bounds // 2)))
+    position, low = positions[(first + part - 1)[row]], (first_limit + 2 * part - 2)[row]
+    room[row, 0], room[row, 1] = limits[low + 1] - position, position - limits[low]
+    return room
+
+
+def _by_rollout(table: Any, cells: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The rows in order of plan, rollout and step, [I], and where in this order each rollout begins."""
+    plan, rollout = _coded(table, "plan_key")[1], cells["rollout"]
+    order = np.lexsort((cells["step"], rollout, plan))
+    is_first = (np.diff(plan[order], prepend=-1) != 0) | (np.diff(rollout[order], prepend=-1) != 0)
+    return order, np.flatnonzero(is_first)

@@ -1,0 +1,129 @@
+"""Features under encoders that are not trained: each encoder's are computed once.
+
+Shapes: I rows and O clouds of a data set, P pool points a cloud, Q points, S proposals.
+"""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from learner.data.dataset import Dataset
+from shared.networks.pointnet2 import CloudBatch, PointNet2
+from shared.networks.prior import Prior
+
+ENCODING_CHUNK = 16
+"""Clouds encoded at once; bounds memory."""
+POOL_POINTS = 16
+"""Movable points of each cloud that proposals are drawn at."""
+MOST_ENCODERS = 3
+"""Whose features are remembered: the prior's, AAP's, and one that comes or goes; each takes some KB a row."""
+
+
+class FrozenFeatures:
+    """Features of a data set's rows, and of a pool of movable points, under whatever encoder is not trained just now.
+
+    Encoders of equal weights share them: AAP keeps its oracle's encoder, and AIP AAP's, and most of the time that a
+    stage takes beside its steps goes to encoding. What was asked for longest ago is forgotten first.
+
+    Attributes:
+        dataset: the interactions.
+        point: the pool's points, indices in their clouds, [O, P]; P is 0 where there is no pool.
+    """
+
+    def __init__(self, dataset: Dataset, point: Tensor | None = None) -> None:
+        self.dataset = dataset
+        self.point = torch.zeros(len(dataset.movable), 0, dtype=torch.long) if point is None else point
+        self._known: dict[str, tuple[Tensor, Tensor]] = {}
+
+    @classmethod
+    def with_pool(cls, dataset: Dataset, rng: np.random.Generator) -> "FrozenFeatures":
+        """Draw the points of a pool once for all of a training stage."""
+        chosen = []
+        for movable in dataset.movable.numpy(force=True):
+            candidates = np.flatnonzero(movable) if movable.any() else np.arange(len(movable))
+            chosen.append(rng.choice(candidates, POOL_POINTS))
+        return cls(dataset, torch.as_tensor(np.stack(chosen)))
+
+    def rows(self, encoder: PointNet2) -> Tensor:
+        """Of the rows' points, [I, point_width]."""
+        return self._under(encoder)[0]
+
+    def pool(self, encoder: PointNet2) -> Tensor:
+        """Of the pool's points, [O, P, point_width]."""
+        return self._under(encoder)[1]
+
+    def _under(self, encoder: PointNet2) -> tuple[Tensor, Tensor]:
+        digest = _weights_digest(encoder)
+        found = self._known.pop(digest, None) or self._encoded(encoder)
+        while len(self._known) >= MOST_ENCODERS:
+            del self._known[next(iter(self._known))]
+        self._known[digest] = found
+        return found
+
+    def _encoded(self, encoder: PointNet2) -> tuple[Tensor, Tensor]:
+        rows = self.dataset.rows
+        owner = torch.arange(len(self.point)).repeat_interleave(self.point.shape[1])
+        cloud, point = torch.cat([rows.cloud, owner]), torch.cat([rows.point, self.point.flatten()])
+        found = frozen_features(encoder, self.dataset.clouds, cloud, point)
+        of_pool = found[len(rows.cloud) :].reshape(*self.point.shape, encoder.width)
+        return found[: len(rows.cloud)], of_pool
+
+
+@dataclass(frozen=True, slots=True)
+class ProposalPool:
+    """A few movable points of each cloud, to draw proposals of the frozen prior at.
+
+    Attributes:
+        point: [O, P], index in the cloud.
+        features: [O, P, point_width], of the prior.
+        prior: whose proposal network draws.
+    """
+
+    point: Tensor
+    features: Tensor
+    prior: Prior
+
+    @classmethod
+    def of(cls, prior: Prior, features: FrozenFeatures) -> "ProposalPool":
+        """The pool's points under a prior."""
+        return cls(features.point, features.pool(prior.encoder), prior)
+
+    @torch.no_grad()
+    def draw(self, cloud: Tensor, slot: Tensor, count: int, rng: np.random.Generator) -> Tensor:
+        """`count` rotations at points of the pool, given by cloud and slot, [Q] each; [Q, count, 6]."""
+        noise = rng.standard_normal((len(cloud), count, self.prior.config.noise_width)).astype(np.float32)
+        return self.prior.propose(self.features[cloud, slot][:, None], torch.as_tensor(noise))
+
+
+@torch.no_grad()
+def frozen_features(encoder: PointNet2, clouds: CloudBatch, cloud: Tensor, point: Tensor) -> Tensor:
+    """Features of points under an encoder that is not trained, [Q, point_width]; each cloud is encoded once.
+
+    Args:
+        encoder: in evaluation mode for the duration.
+        clouds: all clouds.
+        cloud: [Q], which of them.
+        point: [Q].
+    """
+    was_training = encoder.training
+    encoder.eval()
+    features = torch.empty(len(cloud), encoder.width)
+    needed, inverse = torch.unique(cloud, return_inverse=True)
+    for start in range(0, len(needed), ENCODING_CHUNK):
+        chunk = needed[start : start + ENCODING_CHUNK]
+        here = torch.nonzero((inverse >= start) & (inverse < start + len(chunk))).flatten()
+        encoded = encoder(clouds.select(chunk))
+        features[here] = encoder.at(encoded, inverse[here] - start, point[here])
+    encoder.train(was_training)
+    return features
+
+
+def _weights_digest(encoder: PointNet2) -> str:
+    digest = hashlib.sha256()
+    for name, tensor in encoder.state_dict().items():
+        digest.update(name.encode())
+        digest.update(tensor.numpy(force=True).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,1 @@
+"""Tables of methods, adaptation curves and their intervals."""

@@ -1,0 +1,309 @@
+"""The table: what each method knows after each budget of tries, and whether acting on it succeeds.
+
+An evaluation store holds, for each rollout, random QUERY rows that critics are asked about; for each method, CONTEXT
+rows, its tries in order; and for each method and budget, EXPLOIT rows, what the adapted affordance then chose where the
+tries had left the object, and EXPLOIT_AT_START rows, what it chose where they had begun.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from learner.data.dataset import Dataset, load_dataset
+from learner.data.features import FrozenFeatures
+from learner.evaluation.bootstrap import ratio_interval
+from learner.evaluation.critics import OracleScores, row_critic
+from learner.metrics import THRESHOLD, discrimination
+from learner.stages.oracle import OracleCritic
+from learner.stages.trainers import RowCritic
+from shared.errors import StoreError
+from shared.policies.methods import METHODS, CriticName, method_named
+from shared.policies.policy import Policy
+from shared.store.store import Store
+from shared.tasks import TASKS, task_named
+from shared.types import Role
+
+PRIOR_METHOD = "where2act"
+NO_TRIES_METHOD = "aap-no-tries"
+"""AAP before any try: a second, often stronger, prior to compare with."""
+ORACLE_METHOD = "oracle"
+"""A critic that is told the hidden facts: the bound of what tries can teach. It acts on nothing, so has no exploits."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectCounts:
+    """What a row counts on each object, a column each; sums over objects, or over evaluations, are its figures.
+
+    Attributes:
+        object: its id.
+        queries: QUERY rows.
+        true: those that succeeded.
+        claimed: those that the critic called successes.
+        hits: those that both hold of.
+        trials: EXPLOIT rows.
+        successes: those that succeeded.
+        start_trials: EXPLOIT_AT_START rows; where a method tries nothing, these are the EXPLOIT rows.
+        start_successes: those that succeeded.
+    """
+
+    object: tuple[str, ...]
+    queries: tuple[int, ...]
+    true: tuple[int, ...]
+    claimed: tuple[int, ...]
+    hits: tuple[int, ...]
+    trials: tuple[int, ...]
+    successes: tuple[int, ...]
+    start_trials: tuple[int, ...]
+    start_successes: tuple[int, ...]
+
+    def f_score(self) -> tuple[float, float, float]:
+        """F1 = 2 hits / (claimed + true), and its 95% interval over objects; NaN where nothing is claimed or true."""
+        return _ratio(2 * np.array(self.hits), np.add(self.claimed, self.true), self.queries)
+
+    def sample_success(self) -> tuple[float, float, float]:
+        """The share of EXPLOIT rows that succeeded, and its 95% interval over objects; NaN where there are none."""
+        return _ratio(self.successes, self.trials, self.trials)
+
+    def start_success(self) -> tuple[float, float, float]:
+        """The same of EXPLOIT_AT_START rows."""
+        return _ratio(self.start_successes, self.start_trials, self.start_trials)
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationRow:
+    """One method after one budget of tries, on all rollouts together; NaN where there was nothing to measure.
+
+    Attributes:
+        task: what was evaluated.
+        method: whose tries.
+        budget: how many tries a rollout, at the most.
+        f_score: of the critic on the QUERY rows at the threshold 0.5.
+        best_f_score: at the threshold best in hindsight.
+        bce: binary cross entropy, nats.
+        auc: area under the ROC curve.
+        base_rate: share of successes among the QUERY rows.
+        queries: how many QUERY rows.
+        sample_success: share of the EXPLOIT rows that succeeded.
+        start_success: share of the EXPLOIT_AT_START rows that succeeded.
+        trials: how many EXPLOIT rows.
+        mean_tries: tries made a rollout, which stopping may leave below the budget.
+        f_score_low: where its 95% interval over objects begins.
+        f_score_high: where it ends.
+        sample_success_low: where its 95% interval over objects begins.
+        sample_success_high: where it ends.
+        start_success_low: where its 95% interval over objects begins.
+        start_success_high: where it ends.
+        counts: what these are of, by object.
+    """
+
+    task: str
+    method: str
+    budget: int
+    f_score: float
+    best_f_score: float
+    bce: float
+    auc: float
+    base_rate: float
+    queries: int
+    sample_success: float
+    start_success: float
+    trials: int
+    mean_tries: float
+    f_score_low: float
+    f_score_high: float
+    sample_success_low: float
+    sample_success_high: float
+    start_success_low: float
+    start_success_high: float
+    counts: ObjectCounts
+
+
+def evaluate_store(
+    store: Store, version: int, budgets: Sequence[int], oracle: OracleCritic | None = None
+) -> list[EvaluationRow]:
+    """Evaluate a policy version on an evaluation store that holds it, and what its methods did with others.
+
+    Args:
+        store: the evaluation store.
+        version: which policy.
+        budgets: numbers of tries.
+        oracle: to judge beside it.
+
+    Raises:
+        StoreError: the store is damaged, holds no QUERY row, or lacks a policy that a method used.
+    """
+    policies = {version: Policy.from_files(store.read_policy(version))}
+    dataset = load_dataset(store, policies[version].config)
+    for method in _methods(dataset):
+        used = method_named(method).policy_version(version)
+        if used not in policies:
+            policies[used] = Policy.from_files(store.read_policy(used))
+    return evaluate(dataset, policies, version, budgets, oracle)
+
+
+def evaluate(
+    dataset: Dataset,
+    policies: Mapping[int, Policy],
+    version: int,
+    budgets: Sequence[int],
+    oracle: OracleCritic | None = None,
+) -> list[EvaluationRow]:
+    """One row for each method and budget that there are rows of.
+
+    Where2Act, AAP with no tries and the oracle, where there is one, have a row of their own at budget 0.
+
+    Args:
+        dataset: the interactions.
+        policies: that methods used, by version.
+        version: the policy that is evaluated.
+        budgets: numbers of tries.
+        oracle: a critic that is told the hidden facts.
+
+    Raises:
+        StoreError: there is no QUERY row, or the data set is of a task with another primitive than a policy's.
+    """
+    for policy in policies.values():
+        if policy.task != dataset.task and _primitive(policy.task) != _primitive(dataset.task):
+            raise StoreError(f"the store is of task '{dataset.task}', but a policy of '{policy.task}'")
+        policy.modules().eval()
+    judge = _Judge(dataset, policies)
+    rows = [
+        judge.row(PRIOR_METHOD, 0, judge.critic("where2act", version)),
+        judge.row(NO_TRIES_METHOD, 0, judge.critic("aap", version)),
+    ]
+    if oracle is not None:
+        rows.append(judge.row(ORACLE_METHOD, 0, OracleScores(oracle.eval(), judge.known)))
+    for name in _methods(dataset):
+        method = method_named(name)
+        critic = judge.critic(method.critic, method.policy_version(version))
+        rows += [judge.row(name, budget, critic) for budget in method.budgets(budgets)]
+    return rows
+
+
+def _primitive(task: str) -> str | None:
+    """What a task executes; None of one that a file defined, which whoever named both has compared."""
+    return task_named(task).primitive if task in TASKS.names() else None
+
+
+def _methods(dataset: Dataset) -> list[str]:
+    """Methods that made tries, in the order of the paper's table.
+
+    Raises:
+        StoreError: a row is of a method that there is not.
+    """
+    found = set(dataset.rows.method.tolist()) - {""}
+    unknown = sorted(found.difference(METHODS.names()))
+    if unknown:
+        raise StoreError(f"the store holds rows of method '{unknown[0][:40]}'; known: {', '.join(METHODS.names())}")
+    return [name for name in METHODS.names() if name in found and name != PRIOR_METHOD]
+
+
+class _Judge:
+    """Figures of critics on the query rows after what a method tried."""
+
+    def __init__(self, dataset: Dataset, policies: Mapping[int, Policy]) -> None:
+        rows = dataset.rows
+        self.dataset, self.policies = dataset, policies
+        self.known = FrozenFeatures(dataset)
+        self.queries = [index[rows.role[index.numpy()] == Role.QUERY.value] for index in dataset.rollouts]
+        if not sum(map(len, self.queries)):
+            raise StoreError("the store holds no query to judge by; evaluate on a store made by an evaluation plan")
+        self._critics: dict[tuple[CriticName, int], RowCritic] = {}
+        self._names = tuple(sorted(set(dataset.objects)))
+        numbers = {name: number for number, name in enumerate(self._names)}
+        self._object_of = np.zeros(len(rows.success), dtype=np.int64)
+        for index, name in zip(dataset.rollouts, dataset.objects, strict=True):
+            self._object_of[index.numpy()] = numbers[name]
+
+    def critic(self, name: CriticName, version: int) -> RowCritic:
+        """A critic of a policy, made once for all methods that share it."""
+        if (name, version) not in self._critics:
+            self._critics[name, version] = row_critic(name, self.policies[version], self.known)
+        return self._critics[name, version]
+
+    def row(self, method: str, budget: int, critic: RowCritic) -> EvaluationRow:
+        """The figures of a method at a budget."""
+        contexts = [self._context(index, method, budget) for index in self.dataset.rollouts]
+        pairs = [pair for pair in zip(self.queries, contexts, strict=True) if len(pair[0])]
+        scores = [critic(queries, context) for queries, context in pairs]
+        asked = torch.cat([queries for queries, _ in pairs])
+        labels = self.dataset.rows.success[asked].numpy()
+        believed = torch.cat(scores).numpy()
+        found = discrimination(believed, labels)
+        counts = self._counts(method, budget, asked.numpy(), believed >= THRESHOLD, labels > THRESHOLD)
+        (f_score, f_low, f_high), (success, success_low, success_high) = counts.f_score(), counts.sample_success()
+        start, start_low, start_high = counts.start_success()
+        return EvaluationRow(
+            task=self.dataset.task,
+            method=method,
+            budget=budget,
+            f_score=f_score,
+            best_f_score=found.best_f_score,
+            bce=found.bce,
+            auc=found.auc,
+            base_rate=found.base_rate,
+            queries=found.rows,
+            sample_success=success,
+            start_success=start,
+            trials=sum(counts.trials),
+            mean_tries=float(np.mean([len(context) for _, context in pairs])),
+            f_score_low=f_low,
+            f_score_high=f_high,
+            sample_success_low=success_low,
+            sample_success_high=success_high,
+            start_success_low=start_low,
+            start_success_high=start_high,
+            counts=counts,
+        )
+
+    def _counts(
+        self,
+        method: str,
+        budget: int,
+        asked: NDArray[np.int64],
+        claimed: NDArray[np.bool_],
+        true: NDArray[np.bool_],
+    ) -> ObjectCounts:
+        success = self.dataset.rows.success.numpy() > THRESHOLD
+        chosen = self._exploits(Role.EXPLOIT, method, budget)
+        at_start = chosen if method == PRIOR_METHOD else self._exploits(Role.EXPLOIT_AT_START, method, budget)
+
+        def of_objects(rows: NDArray[np.int64]) -> tuple[int, ...]:
+            return tuple(np.bincount(self._object_of[rows], minlength=len(self._names)).tolist())
+
+        return ObjectCounts(
+            object=self._names,
+            queries=of_objects(asked),
+            true=of_objects(asked[true]),
+            claimed=of_objects(asked[claimed]),
+            hits=of_objects(asked[claimed & true]),
+            trials=of_objects(chosen),
+            successes=of_objects(chosen[success[chosen]]),
+            start_trials=of_objects(at_start),
+            start_successes=of_objects(at_start[success[at_start]]),
+        )
+
+    def _context(self, index: Tensor, method: str, budget: int) -> Tensor:
+        """A rollout's first `budget` tries of a method; the rows of a rollout are in order of step."""
+        rows, numbers = self.dataset.rows, index.numpy()
+        return index[(rows.role[numbers] == Role.CONTEXT.value) & (rows.method[numbers] == method)][:budget]
+
+    def _exploits(self, role: Role, method: str, budget: int) -> NDArray[np.int64]:
+        """Rows of the exploits; those of a prior count whatever budget they are listed under."""
+        rows = self.dataset.rows
+        chosen = (rows.role == role.value) & (rows.method == method)
+        if method != PRIOR_METHOD:
+            chosen &= rows.budget == budget
+        return np.flatnonzero(chosen)
+
+
+def _ratio(above: ArrayLike, below: ArrayLike, rows: ArrayLike) -> tuple[float, float, float]:
+    """sum(above) / sum(below) over the objects with any rows, and its 95% interval."""
+    seen = np.flatnonzero(rows)
+    over, under = np.asarray(above)[seen], np.asarray(below)[seen]
+    whole = float(over.sum() / under.sum()) if under.sum() else float("nan")
+    return whole, *ratio_interval(over, under, seen)

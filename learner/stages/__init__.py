@@ -1,0 +1,1 @@
+"""The stages of training: prior, AAP, AIP, the oracle and the baselines."""

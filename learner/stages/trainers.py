@@ -1,0 +1,258 @@
+"""What each stage trains, one network after the other."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from learner.data.cached_features import FrozenAap
+from learner.data.dataset import Dataset, Split
+from learner.data.features import FrozenFeatures, ProposalPool
+from learner.settings import AffordanceConfig, LearnerConfig, LearnerSettings, TrainingConfig
+from learner.stages.aap import AapStage, OracleStage
+from learner.stages.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic, RowOrder
+from learner.stages.aip import AipStage
+from learner.stages.oracle import OracleCritic, Teacher
+from learner.stages.prior import PriorStage
+from learner.training import data_parallel
+from learner.training.hardware import Hardware
+from learner.training.loop import Stage, TrainingResult, train
+from shared.config import parse
+from shared.errors import UsageError
+from shared.io.files import write_atomically
+from shared.policies.methods import BASELINES, BaselineName, ModuleName
+from shared.policies.policy import Policy
+from shared.seeds import generator, torch_seed
+
+ORACLE_FILE = "oracle.safetensors"
+ORACLE_FOLDER = "oracle"
+AFFORDANCE_FOLDER = "affordance"
+
+
+@dataclass(frozen=True, slots=True)
+class Runner:
+    """Trains the networks of one stage one after the other, each with checkpoints of its own."""
+
+    out: Path
+    seed: int
+    fingerprint: str
+    hardware: Hardware
+
+    def train(self, stage: Stage, settings: TrainingConfig, title: str, subfolder: str = "") -> TrainingResult:
+        """Train one network."""
+        folder = self.out / subfolder
+        folder.mkdir(exist_ok=True)
+        return train(stage, settings, self.seed, folder, self.fingerprint, title, self.hardware)
+
+    def train_affordance(
+        self, stage: AffordanceStage, settings: AffordanceConfig, before: TrainingResult
+    ) -> TrainingResult:
+        """Train D; returns the critic's result with D's figures added."""
+        result = self.train(stage, settings, stage.name, AFFORDANCE_FOLDER)
+        stage.module.eval().requires_grad_(False)
+        figures = {name: value for name, value in result.metrics.items() if name != "score"}
+        return replace(before, seconds=before.seconds + result.seconds, metrics=before.metrics | figures)
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What the stages have in common: a policy of which one module is trained, from what, and how.
+
+    Attributes:
+        config: the settings.
+        policy: the modules.
+        known: the interactions, and features of them.
+        parts: which to learn from, and which to judge by.
+        runner: trains one network.
+        oracle: what privileged training of AAP left, to teach further stages; None where there is none.
+    """
+
+    config: LearnerConfig
+    policy: Policy
+    known: FrozenFeatures
+    parts: Split
+    runner: Runner
+    oracle: OracleCritic | None = None
+
+    @property
+    def dataset(self) -> Dataset:
+        """The interactions."""
+        return self.known.dataset
+
+    def train(self, stage: ModuleName) -> TrainingResult:
+        """Train one module of the policy; the others stay as they are."""
+        self.policy.modules().eval().requires_grad_(False)
+        match stage:
+            case "prior":
+                return self._prior()
+            case "aap":
+                return self._aap()
+            case "aip":
+                return self._aip()
+            case _:
+                return training_of(stage).train(self, settings_of(self.config, stage))
+
+    def _prior(self) -> TrainingResult:
+        prior, config = self.policy.prior.requires_grad_(True), self.config.prior
+        result = self.runner.train(PriorStage(prior, self.dataset, self.parts, config), config, "prior")
+        prior.eval().requires_grad_(False)
+        pool = self.pool()
+        affordance = self.affordance("prior", PriorCritic(prior, pool), config.affordance, pool)
+        return self.runner.train_affordance(affordance, config.affordance, result)
+
+    def _aap(self) -> TrainingResult:
+        aap, config, pool = self.policy.aap.requires_grad_(True), self.config.aap, self.pool()
+        # An AAP that has been trained has a z of its own, which a new oracle would only disturb; the old one may teach.
+        trained, oracle = "aap" in self.policy.trained, self.oracle
+        if config.training == "privileged" and not trained:
+            oracle = self._oracle()
+        teacher = self._teacher(oracle if config.training == "privileged" else None)
+        stage = AapStage(aap, self.known, self.parts, config, teacher, trained=trained)
+        result = self.runner.train(stage, config, "aap")
+        frozen = FrozenAap.of(aap, self.known)
+        affordance = self.affordance("aap", AapCritic(frozen, config.top), config.affordance, pool, frozen)
+        return self.runner.train_affordance(affordance, config.affordance, result)
+
+    def _aip(self) -> TrainingResult:
+        aip, config, pool = self.policy.aip.requires_grad_(True), self.config.aip, self.pool()
+        frozen = FrozenAap.of(self.policy.aap, self.known)
+        teacher = self._teacher(self.oracle if config.training == "inherited" else None)
+        stage = AipStage(aip, self.dataset, self.parts, config, frozen, teacher)
+        result = self.runner.train(stage, config, "aip")
+        aip.eval().requires_grad_(False)
+        critic = AipCritic(aip, self.known.pool(aip.encoder), frozen, config.top)
+        affordance = self.affordance("aip", critic, config.affordance, pool, frozen)
+        return self.runner.train_affordance(affordance, config.affordance, result)
+
+    def affordance(
+        self,
+        stage: ModuleName,
+        critic: Critic,
+        config: AffordanceConfig,
+        pool: ProposalPool,
+        frozen: FrozenAap | None = None,
+        order: RowOrder | None = None,
+        shortest: int = 0,
+    ) -> AffordanceStage:
+        """The stage that trains a module's D, when its critic is done."""
+        rng = generator(self.config.seed, f"learner.{stage}.questions")
+        name = f"{stage}-affordance"
+        return AffordanceStage(
+            name, critic, self.dataset, self.parts, config, pool, rng, frozen=frozen, order=order, shortest=shortest
+        )
+
+    def pool(self) -> ProposalPool:
+        """Rotations that the prior proposes at the points of the pool."""
+        return ProposalPool.of(self.policy.prior, self.known)
+
+    def _teacher(self, oracle: OracleCritic | None) -> Teacher | None:
+        """What the oracle says of all rows; nothing where there is none."""
+        return None if oracle is None else Teacher.of(oracle, self.known)
+
+    def _oracle(self) -> OracleCritic:
+        """Train the oracle critic, save it, and start AAP from it."""
+        # Drawn on the CPU, so that the first weights are the same whatever device trains them.
+        with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+            torch.manual_seed(torch_seed(self.config.seed, "learner.stages.oracle") % 2**32)
+            critic = OracleCritic(copy.deepcopy(self.policy.aap), self.dataset.rows.facts.shape[1])
+        critic.to(self.runner.hardware.device)
+        config = self.config.aap
+        settings = config.model_copy(
+            update={"steps": config.oracle_steps, "learning_rate": config.oracle_learning_rate}
+        )
+        self.runner.train(OracleStage(critic, self.dataset, self.parts, config), settings, "oracle", ORACLE_FOLDER)
+        if data_parallel.rank() == 0:
+            weights = save({name: tensor.contiguous() for name, tensor in critic.state_dict().items()})
+            write_atomically(self.runner.out / ORACLE_FILE, weights)
+        for inherited in ("encoder", "action_encoder", "critic_head"):
+            getattr(self.policy.aap, inherited).load_state_dict(getattr(critic.aap, inherited).state_dict())
+        return critic
+
+
+class RowCritic(Protocol):
+    """What a method believes of rows after tries of the same rollout."""
+
+    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
+        """Scores in [0, 1] of rows, [Q], after the rows `tries`, [K], of which there may be none; [Q]."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """What one step of a training works through, for estimates.
+
+    Attributes:
+        rollouts: whose clouds are encoded, forward and backward.
+        rows: that pass a critic.
+        encoders: point encoders that are frozen and see every cloud once.
+    """
+
+    rollouts: int
+    rows: int
+    encoders: int
+
+
+@dataclass(frozen=True, slots=True)
+class BaselineTraining:
+    """How a baseline is trained, and judged by rows (`shared.policies.methods.Baseline` names where it stands).
+
+    Attributes:
+        settings: the model of its settings.
+        train: trains its network, `recipe.policy.baselines[name]`, on `recipe.dataset`; of a recipe and the settings.
+        row_critic: what the trained network of a policy believes of the rows of a data set.
+        load: of a step, by the settings.
+        table: the table of its settings in `LearnerSettings`; "": `baselines.NAME`.
+    """
+
+    settings: type[TrainingConfig]
+    train: Callable[[Recipe, Any], TrainingResult]
+    row_critic: Callable[[Policy, FrozenFeatures], RowCritic]
+    load: Callable[[Any], Load]
+    table: str = ""
+
+
+def training_of(name: BaselineName) -> BaselineTraining:
+    """How a baseline is trained.
+
+    Raises:
+        UsageError: there is no such baseline, or what trains it cannot be imported.
+    """
+    place = BASELINES.get(name).training
+    try:
+        training = EntryPoint(name, place, "training").load()
+    except Exception as error:
+        raise UsageError(
+            f"baseline '{name}': '{place}' cannot be imported ({type(error).__name__}: {error})"
+        ) from error
+    if not isinstance(training, BaselineTraining):
+        raise UsageError(f"baseline '{name}': '{place}' is no BaselineTraining")
+    return training
+
+
+def settings_of(settings: LearnerSettings, name: BaselineName) -> TrainingConfig:
+    """The settings of a baseline.
+
+    Raises:
+        UsageError: one of them is unknown or not allowed.
+    """
+    training = training_of(name)
+    told = getattr(settings, training.table) if training.table else settings.baselines.get(name, {})
+    return told if isinstance(told, training.settings) else parse(training.settings, told, f"baselines.{name}")
+
+
+def check_baselines(settings: LearnerSettings) -> None:
+    """Refuse settings of baselines that would be found wrong, or not be found, when these are trained.
+
+    Raises:
+        UsageError: there is no such baseline, or one of its settings is unknown or not allowed.
+    """
+    for name in settings.baselines:
+        if table := training_of(name).table:
+            raise UsageError(f"settings of the baseline '{name}' belong into the table '{table}', not into 'baselines'")
+        settings_of(settings, name)

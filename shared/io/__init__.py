@@ -1,0 +1,1 @@
+"""Files, JSON and text that nobody vouches for, and private folders."""

@@ -1,0 +1,260 @@
+"""Test time: what a history of tries says about an object (`shared.policies.proposers` says what to try next).
+
+Everything here runs on the CPU in a few milliseconds a step, needs nothing but a policy, and depends on its random
+generator alone.
+
+Shapes: N points of a cloud, A actions, S proposals at a point.
+"""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from shared.errors import UsageError
+from shared.geometry import gripper_rotation, points_in_view, view_from_world
+from shared.networks.aap import Aap
+from shared.networks.actions import middle_of
+from shared.networks.grouping import group_cloud, nearest_points
+from shared.networks.pointnet2 import CloudBatch, EncodedClouds, PointNet2
+from shared.policies.methods import ModuleName
+from shared.policies.policy import Policy
+from shared.types import Action, Float, Float32, Interaction, Observation
+
+PROPOSALS = 100
+"""Actions sampled at a point (AdaAfford, Next-step Interaction Action Proposal)."""
+MAX_CACHED_OBSERVATIONS = 64
+
+
+@dataclass(slots=True)
+class _Entry:
+    """What is kept of one observation; holding it keeps its identity from being reused."""
+
+    observation: Observation
+    clouds: CloudBatch
+    around: NDArray[np.int16]
+    middle: Tensor
+    encoded: dict[str, EncodedClouds]
+
+
+@dataclass(frozen=True, slots=True)
+class Proposals:
+    """Rotations at one point.
+
+    Attributes:
+        point: index of p.
+        frames: approach and forward, view frame, [S, 6].
+    """
+
+    point: int
+    frames: Tensor
+
+
+class Adapter:
+    """A policy at test time.
+
+    Clouds are encoded when first needed and remembered by the identity of their observation, so that a history costs
+    one small network a step.
+
+    Example:
+        >>> adapter = Adapter(Policy.from_files(files))
+        >>> before = adapter.affordance(observation, [])         # [N], AAP with no tries
+        >>> after = adapter.affordance(observation, history)     # [N], adapted
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        policy.modules().eval()
+        self._entries: OrderedDict[int, _Entry] = OrderedDict()
+
+    def encode(self, observation: Observation, module: ModuleName = "aap") -> EncodedClouds:
+        """The observation's cloud under a module's encoder, computed once."""
+        entry = self._entry(observation)
+        if module not in entry.encoded:
+            with torch.inference_mode():
+                entry.encoded[module] = self._encoder(module)(entry.clouds)
+        return entry.encoded[module]
+
+    @torch.inference_mode()
+    def z(self, history: Sequence[Interaction], module: ModuleName = "aap") -> Tensor:
+        """The hidden information in a history, [latent_width]; order does not matter, and none is allowed."""
+        latent = self.policy.config.latent_width
+        codes, weights = torch.zeros(0, latent), torch.zeros(0)
+        if history:
+            parts = [self._interaction_code(interaction, module) for interaction in history]
+            codes, weights = torch.cat([code for code, _ in parts]), torch.cat([weight for _, weight in parts])
+        return self._adaptive(module).latent(codes, weights)
+
+    @torch.inference_mode()
+    def affordance(
+        self,
+        observation: Observation,
+        history: Sequence[Interaction],
+        module: ModuleName = "aap",
+        points: NDArray[np.int64] | None = None,
+    ) -> Float32:
+        """A_I: the AAP actionability after a history, in [0, 1], of every point, [N], or of those at `points` alone."""
+        asked = np.arange(len(observation.points)) if points is None else points
+        features, places = self.features(observation, module, asked), self.places(observation, asked)
+        return self._adaptive(module).actionability(features, places, self.z(history, module)).numpy()
+
+    @torch.inference_mode()
+    def prior_affordance(self, observation: Observation, points: NDArray[np.int64] | None = None) -> Float32:
+        """A: Where2Act's actionability, in [0, 1], of every point, [N], or of those at `points` alone."""
+        asked = np.arange(len(observation.points)) if points is None else points
+        features, places = self.features(observation, "prior", asked), self.places(observation, asked)
+        return self.policy.prior.actionability(features, places).numpy()
+
+    @torch.inference_mode()
+    def score(
+        self,
+        observation: Observation,
+        actions: Sequence[Action],
+        history: Sequence[Interaction],
+        module: ModuleName = "aap",
+    ) -> Float32:
+        """The AAP scores s_u|z of actions after a history, [A], in [0, 1]."""
+        indices = point_indices(actions)
+        features = self.features(observation, module, indices)
+        points, frames = self.places(observation, indices), frames_in_view(observation, actions)
+        logits = self._adaptive(module).action_logits(features, points, frames, self.z(history, module))
+        return torch.sigmoid(logits).numpy()
+
+    @torch.inference_mode()
+    def prior_score(self, observation: Observation, actions: Sequence[Action]) -> Float32:
+        """Where2Act's scores of actions, [A], in [0, 1]."""
+        indices = point_indices(actions)
+        features = self.features(observation, "prior", indices)
+        points, frames = self.places(observation, indices), frames_in_view(observation, actions)
+        return torch.sigmoid(self.policy.prior.action_logits(features, points, frames)).numpy()
+
+    @torch.inference_mode()
+    def features(self, observation: Observation, module: ModuleName, points: NDArray[np.int64]) -> Tensor:
+        """All that a module knows of points, [len(points), point_width]."""
+        index, entry = torch.from_numpy(points), self._entry(observation)
+        features = self._encoder(module).features_at(self.encode(observation, module), torch.zeros_like(index), index)
+        around = torch.from_numpy(entry.around[points].astype(np.int64))
+        offsets = entry.clouds.points[0, around] - entry.clouds.points[0, index][:, None]
+        return torch.cat([features, offsets.flatten(1)], dim=-1)
+
+    def places(self, observation: Observation, points: NDArray[np.int64]) -> Tensor:
+        """Places as actions are told them: p less the middle of what may be moved, [len(points), 3]."""
+        entry = self._entry(observation)
+        return entry.clouds.points[0, torch.from_numpy(points)] - entry.middle
+
+    @torch.inference_mode()
+    def proposals(self, observation: Observation, point: int, rng: np.random.Generator) -> Proposals:
+        """Rotations at a point, from the prior's Action Proposal Network."""
+        noise = rng.standard_normal((PROPOSALS, self.policy.config.noise_width)).astype(np.float32)
+        features = self.features(observation, "prior", np.array([point]))
+        return Proposals(point, self.policy.prior.propose(features, torch.from_numpy(noise)))
+
+    @torch.inference_mode()
+    def score_proposals(
+        self, observation: Observation, proposals: Proposals, latent: Tensor, module: ModuleName = "aap"
+    ) -> Tensor:
+        """The AAP scores s_u|z of proposals, [S]."""
+        index = np.array([proposals.point])
+        features, points = self.features(observation, module, index), self.places(observation, index)
+        return torch.sigmoid(self._adaptive(module).action_logits(features, points, proposals.frames, latent))
+
+    @torch.inference_mode()
+    def prior_score_proposals(self, observation: Observation, proposals: Proposals) -> Tensor:
+        """Where2Act's scores of proposals, [S]."""
+        index = np.array([proposals.point])
+        features = self.features(observation, "prior", index)
+        points = self.places(observation, index)
+        return torch.sigmoid(self.policy.prior.action_logits(features, points, proposals.frames))
+
+    @torch.inference_mode()
+    def information_proposals(self, observation: Observation, proposals: Proposals, latent: Tensor) -> Tensor:
+        """The AIP scores s^AIP_u|z of proposals, [S]."""
+        index = np.array([proposals.point])
+        features = self.features(observation, "aip", index)
+        scores = self.score_proposals(observation, proposals, latent)
+        points = self.places(observation, index)
+        return self.policy.aip.action_scores(features, points, proposals.frames, latent, scores)
+
+    @torch.inference_mode()
+    def information(self, observation: Observation, points: NDArray[np.int64], latent: Tensor) -> Float32:
+        """The AIP actionability a^AIP_p|z of the points at the indices `points`, [len(points)]."""
+        places = self.places(observation, points)
+        expected = self.policy.aap.actionability(self.features(observation, "aap", points), places, latent)
+        features = self.features(observation, "aip", points)
+        return self.policy.aip.actionability(features, places, latent, expected).numpy()
+
+    def _entry(self, observation: Observation) -> _Entry:
+        entry = self._entries.get(id(observation))
+        if entry is None:
+            points = points_in_view(observation)
+            clouds = CloudBatch.of([points], [group_cloud(points, self.policy.config)])
+            middle = middle_of(clouds.points[0], torch.from_numpy(observation.movable))
+            around = nearest_points(points, self.policy.config.surroundings)
+            entry = self._entries[id(observation)] = _Entry(observation, clouds, around, middle, {})
+            if len(self._entries) > MAX_CACHED_OBSERVATIONS:
+                self._entries.popitem(last=False)
+        self._entries.move_to_end(id(observation))
+        return entry
+
+    def _adaptive(self, module: ModuleName) -> Aap:
+        """A network that encodes a history into z, and scores under it."""
+        if module == "aap":
+            return self.policy.aap
+        self.policy.require(module)
+        return self.policy.baseline(module, Aap)
+
+    def _encoder(self, module: ModuleName) -> PointNet2:
+        match module:
+            case "prior":
+                return self.policy.prior.encoder
+            case "aip":
+                return self.policy.aip.encoder
+            case _:
+                return self._adaptive(module).encoder
+
+    def _interaction_code(self, interaction: Interaction, module: ModuleName) -> tuple[Tensor, Tensor]:
+        index = np.array([interaction.action.point_index])
+        return self._adaptive(module).interaction_codes(
+            self.features(interaction.observation, module, index),
+            self.places(interaction.observation, index),
+            frames_in_view(interaction.observation, [interaction.action]),
+            torch.tensor([interaction.outcome.motion], dtype=torch.float32),
+            torch.tensor([float(interaction.outcome.success)]),
+        )
+
+
+def movable_points(observation: Observation) -> NDArray[np.int64]:
+    """Indices of the points that the task may act on.
+
+    Raises:
+        UsageError: there are none.
+    """
+    points = np.flatnonzero(observation.movable)
+    if not len(points):
+        raise UsageError("the observation has no movable point; look from another side, or mark the points to act on")
+    return points
+
+
+def point_indices(actions: Sequence[Action]) -> NDArray[np.int64]:
+    """Indices of the points that actions touch, [A]."""
+    return np.array([action.point_index for action in actions], dtype=np.int64)
+
+
+def frames_in_view(observation: Observation, actions: Sequence[Action]) -> Tensor:
+    """Approach and forward of actions in the observation's view frame, [A, 6]."""
+    view = view_from_world(observation.world_from_camera)
+    rows = [np.concatenate([view @ action.approach, view @ action.forward]) for action in actions]
+    return torch.from_numpy(np.array(rows, dtype=np.float32).reshape(-1, 6))
+
+
+def action_from_frame(observation: Observation, point: int, frame: Tensor) -> Action:
+    """The action at a point of the observation whose approach and forward, [6], are given in the view frame."""
+    view = view_from_world(observation.world_from_camera)
+    approach, forward = frame.double().numpy().reshape(2, 3) @ view
+    approach /= np.linalg.norm(approach)
+    rotation: Float = gripper_rotation(approach, forward)
+    return Action(point, observation.points[point].astype(np.float64), rotation)

@@ -1,0 +1,173 @@
+"""The methods that are compared: who fills the set of interactions, who acts on it, and with which policy.
+
+They share one loop and differ in one thing each (AdaAfford, Baselines and Ablation Study, and its supplement). Methods
+and what they consist of are found by name: ours, and what packages add by entry points (docs/extending.md). Ours are
+named by their place here, so that this module, which every command imports, needs no network.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from shared.config import Name
+from shared.errors import UsageError
+from shared.extensions import Registry
+from shared.types import Proposer
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from shared.networks.network_config import NetworkConfig
+    from shared.networks.prior import Prior
+    from shared.policies.adaptation import Adapter
+    from shared.policies.critics import Critic
+
+MethodName = Name
+BaselineName = Name
+CriticName = Name
+"""Of whose beliefs count: where2act, aap, or a baseline."""
+ModuleName = Name
+"""Of a network that a policy may hold: prior, aap, aip, or a baseline."""
+
+RANDOM = "random"
+"""The proposer that needs no policy, and that everything is compared with."""
+FIRST_VERSION = 1
+"""The policy of the first round of the alternation."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProposerKind:
+    """A kind of proposer.
+
+    Attributes:
+        make: makes one of an `Adapter`, a random generator and the most tries that it may propose; where it needs no
+            networks, there may be None in place of the adapter.
+        modules: the networks that it needs; none: it proposes without a policy.
+    """
+
+    make: Callable[[Any, np.random.Generator, int], Proposer]
+    modules: tuple[ModuleName, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """A network that is compared with AAP, and is trained only where a method wants it.
+
+    Attributes:
+        network: makes the network, whatever its weights.
+        critic: what a history of tries makes it believe; of an adapter whose policy holds the trained network.
+        training: "module:attribute" of its `learner.stages.trainers.BaselineTraining`. Only the learner imports that, since a
+            robot that carries the network does not train it.
+        begin: makes the network as it is before training, from a trained prior; None: as `network` does.
+        needs: networks that are trained before it; the last of them is the stage to start from.
+    """
+
+    network: "Callable[[NetworkConfig], nn.Module]"
+    critic: "Callable[[Adapter], Critic]"
+    training: str
+    begin: "Callable[[Prior], nn.Module] | None" = None
+    needs: tuple[ModuleName, ...] = ("prior",)
+
+
+PROPOSERS = Registry(
+    "proposer",
+    ProposerKind,
+    {
+        "aip": "shared.policies.proposers:AIP",
+        "fps": "shared.policies.fps:FPS",
+        "purefps": "shared.policies.fps:PURE_FPS",
+        "argfps": "shared.policies.fps:WEIGHTED_FPS",
+        "where2act-fps": "shared.policies.fps:WHERE2ACT_FPS",
+    },
+)
+BASELINES = Registry(
+    "baseline",
+    Baseline,
+    {
+        "where2act-interaction": "shared.policies.where2act_interaction:BASELINE",
+        "where2act-adaptation": "shared.policies.where2act_adaptation:BASELINE",
+    },
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One method.
+
+    Attributes:
+        tries: who fills the set of interactions; None: nobody.
+        critic: whose scores and actionability are judged, and choose the action in the end.
+        in_one_shot: the number of tries that it takes whatever the budget, where it takes no other.
+        version: the policy version that it uses; None: the one that is evaluated.
+    """
+
+    tries: Name | None
+    critic: CriticName
+    in_one_shot: int | None = None
+    version: int | None = None
+
+    def budgets(self, wanted: Sequence[int]) -> list[int]:
+        """The numbers of tries after which it is judged, in ascending order."""
+        return sorted(set(wanted)) if self.in_one_shot is None else [self.in_one_shot]
+
+    @property
+    def modules(self) -> tuple[ModuleName, ...]:
+        """The networks that it needs, each once; the prior's proposals serve all."""
+        own = () if self.critic == "where2act" else (self.critic,)
+        tried_by = () if self.tries is None or self.tries == RANDOM else PROPOSERS.get(self.tries).modules
+        return tuple(dict.fromkeys(("prior", *own, *tried_by)))
+
+    def policy_version(self, evaluated: int) -> int:
+        """The policy version that it uses where version `evaluated` is evaluated."""
+        return evaluated if self.version is None else min(self.version, evaluated)
+
+
+METHODS: Registry[Method] = Registry(
+    "method",
+    Method,
+    {
+        "where2act": Method(None, "where2act"),
+        "where2act-interaction": "shared.policies.where2act_interaction:METHOD",
+        "where2act-adaptation": "shared.policies.where2act_adaptation:METHOD",
+        "ours-random": Method("random", "aap"),
+        "ours-purefps": Method("purefps", "aap"),
+        "ours-argfps": Method("argfps", "aap"),
+        "ours-fps": Method("fps", "aap"),
+        "ours-no-iteration": Method("aip", "aap", version=FIRST_VERSION),
+        "ours-final": Method("aip", "aap"),
+    },
+)
+"""In the order of the paper's table."""
+
+
+def method_named(name: MethodName) -> Method:
+    """The method called `name`.
+
+    Raises:
+        UsageError: there is no such method; the message lists those there are.
+    """
+    return METHODS.get(name)
+
+
+def needs_policy(proposer: Name) -> bool:
+    """Whether a proposer uses networks.
+
+    Raises:
+        UsageError: there is no such proposer; the message lists those there are.
+    """
+    if proposer != RANDOM and proposer not in PROPOSERS.names():
+        raise UsageError(f"unknown proposer '{proposer}'; allowed: {', '.join((RANDOM, *PROPOSERS.names()))}")
+    return proposer != RANDOM and bool(PROPOSERS.get(proposer).modules)
+
+
+def baselines_of(methods: Sequence[MethodName]) -> list[BaselineName]:
+    """The networks of their own that methods need, each once."""
+    wanted = {METHODS.get(name).critic for name in methods}
+    return [name for name in BASELINES.names() if name in wanted]
+
+
+def versions_of(methods: Sequence[MethodName], evaluated: int) -> list[int]:
+    """The policy versions that methods use where version `evaluated` is evaluated, which is one of them."""
+    return sorted({METHODS.get(name).policy_version(evaluated) for name in methods} | {evaluated})

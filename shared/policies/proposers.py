@@ -1,0 +1,111 @@
+"""Proposers that use a policy: what to try next, and what to do in the end.
+
+Everything here runs on the CPU in a few milliseconds a step and depends on its random generator alone.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from shared.errors import UsageError
+from shared.policies.adaptation import Adapter, action_from_frame, movable_points
+from shared.policies.critics import best_action, critic_named, critic_names
+from shared.policies.methods import PROPOSERS, CriticName, ProposerKind
+from shared.types import Action, Interaction, Observation, Proposer
+
+TOP_POINTS = 100
+"""Points that an exploit is drawn from (AdaAfford, Evaluation Metrics)."""
+STOP_THRESHOLD = 0.0
+"""The paper says "e.g., 0.05", but the AIP score is a drop of a loss whose mean here is about 0.003, so that 0.05 would
+stop at once; 0 stops where no point promises any gain."""
+
+
+class AipProposer:
+    """What to try next, by the AIP module (AdaAfford, Next-step Interaction Action Proposal).
+
+    The point with the highest AIP actionability among the movable ones, and there the best by the AIP critic of 100
+    rotations from the prior's proposal network. Stops when the budget is reached, or when the highest actionability is
+    below the threshold (AdaAfford, Stopping Criterion).
+
+    Deviation: `at_least` tries are made whatever the threshold says, since no history at all tells nothing.
+    """
+
+    name = "aip"
+
+    def __init__(
+        self,
+        adapter: Adapter,
+        rng: np.random.Generator,
+        budget: int,
+        threshold: float = STOP_THRESHOLD,
+        at_least: int = 1,
+    ) -> None:
+        adapter.policy.require("prior", "aap", "aip")
+        self.adapter = adapter
+        self.rng = rng
+        self.budget = budget
+        self.threshold = threshold
+        self.at_least = at_least
+
+    def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
+        """The next action, or None to stop."""
+        if len(history) >= self.budget:
+            return None
+        candidates = movable_points(observation)
+        latent = self.adapter.z(history)
+        information = self.adapter.information(observation, candidates, latent)
+        if len(history) >= self.at_least and float(information.max()) < self.threshold:
+            return None
+        point = int(candidates[information.argmax()])
+        proposals = self.adapter.proposals(observation, point, self.rng)
+        best = int(self.adapter.information_proposals(observation, proposals, latent).argmax())
+        return action_from_frame(observation, point, proposals.frames[best])
+
+
+AIP = ProposerKind(AipProposer, ("prior", "aap", "aip"))
+
+
+class ExploitProposer:
+    """The action that a critic believes in most (AdaAfford, Evaluation Metrics, sample-success).
+
+    A random one of the 100 movable points with the highest actionability, and there the best by the critic of 100
+    rotations from the prior's proposal network.
+    """
+
+    def __init__(self, adapter: Adapter, rng: np.random.Generator, critic: CriticName = "aap") -> None:
+        self.name = critic
+        self.critic = critic_named(critic, adapter)
+        self.adapter = adapter
+        self.rng = rng
+
+    def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
+        """The action to execute; never None."""
+        candidates = movable_points(observation)
+        scores = self.critic.affordance(observation, candidates, history)
+        # A stable sort makes the choice among equal scores independent of the machine.
+        best_first = candidates[np.argsort(-scores, kind="stable")]
+        point = int(self.rng.choice(best_first[:TOP_POINTS]))
+        return best_action(self.critic, self.adapter, observation, point, history, self.rng)
+
+
+def proposer_named(name: str, adapter: Adapter | None, rng: np.random.Generator, budget: int) -> Proposer:
+    """The proposer that rows call `name`.
+
+    Args:
+        name: one of `shared.policies.methods.PROPOSERS`, or a critic's, to exploit what it believes.
+        adapter: the policy; None where the proposer needs none.
+        rng: draws what it draws.
+        budget: how many tries it may propose.
+
+    Raises:
+        UsageError: there is none of that name, or the networks that it needs are not trained.
+    """
+    if name in PROPOSERS.names():
+        kind = PROPOSERS.get(name)
+        if adapter is not None:
+            adapter.policy.require(*kind.modules)
+        return kind.make(adapter, rng, budget)
+    if name in critic_names() and adapter is not None:
+        return ExploitProposer(adapter, rng, name)
+    known = ", ".join((*PROPOSERS.names(), *critic_names()))
+    raise UsageError(f"no proposer is called '{name}'; allowed: {known}")

@@ -1,0 +1,225 @@
+"""What is under way: a breadcrumb of each worker's rollout, and the last words of workers that crashed.
+
+    STORE/underway/<process>.json    the rollout that this process executes at this moment
+    STORE/underway/<process>.fault   where it was when it crashed or hung; empty as long as all is well
+
+They lie in the store since that is all that workers and driver are sure to share. A file is named by the process that
+wrote it, so that none is ever taken for another's, however many have tried the same rollout. Nothing here is forced to
+the disk: a breadcrumb matters after the end of a process, not of a machine.
+
+Of a store in a bucket the breadcrumbs lie there too, but last words cannot: a handler of signals writes to an open file
+and no further. They stay on the worker's machine, in a folder of its user alone (`shared.io.private`), and a driver on
+another one takes a crash for a loss.
+"""
+
+import hashlib
+import os
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import IO, TYPE_CHECKING
+
+from pydantic import Field, ValidationError
+
+from shared.config import StrictModel
+from shared.errors import StoreError
+from shared.io.files import DAY_S, is_abandoned, is_gone, process_name, read_bounded
+from shared.io.private import private_folder
+
+if TYPE_CHECKING:
+    from shared.store.backends.base import Place
+
+UNDERWAY_FOLDER = "underway"
+
+_ABANDONED_S = 30 * DAY_S
+"""A worker of another machine may wait for its next job for days, while a policy is trained."""
+_WORKER_SILENT_S = 600.0
+"""A worker says before each rollout what it does; hardly any takes longer."""
+_CRUMB, _FAULT = ".json", ".fault"
+_CRUMB_BYTES = 256
+_MAX_BYTES = 1 << 16
+_FRAMES = 2
+"""Frames of a traceback that a reason names, from the innermost outwards."""
+_FRAME = re.compile(r'  File "(?P<file>[^"]*)", line (?P<line>\d+) in (?P<function>.*)')
+_TIMEOUT = re.compile(r"Timeout \((?P<limit>[\d:.]+)\)!")
+
+
+class Crumb(StrictModel):
+    """What a process is doing."""
+
+    shard_id: str = Field(max_length=100)
+    """Of the job."""
+    rollout: int | None = Field(ge=0)
+    """The one under way; None while the shard is written, and after that until the next job."""
+    written: float = Field(0.0, ge=0)
+    """Seconds since 1970."""
+
+
+@dataclass(frozen=True, slots=True)
+class Underway:
+    """What is under way in one store.
+
+    Attributes:
+        folder: of the breadcrumbs and last words; None: of a store in a bucket, whose last words each machine keeps in
+            its user's private folder.
+        url: of a store in a bucket.
+
+    Example:
+        underway.leave(Crumb(shard_id=job.shard_id, rollout=17))    # the worker's process
+        underway.crumb_of(process), underway.fault_of(process)      # the driver, once that process has ended
+    """
+
+    folder: Path | None
+    url: str = ""
+
+    def leave(self, crumb: Crumb) -> None:
+        """Say what this process does now.
+
+        Raises:
+            StoreError: the bucket is out of reach.
+            OSError: the file cannot be written; no older one is then left that would blame the wrong rollout.
+        """
+        if self.url:
+            _place(self.url).replace(_key(process_name()), crumb.model_dump_json().encode())
+            return
+        file = self._file(process_name(), _CRUMB)
+        try:
+            _overwrite(file, crumb.model_dump_json().encode())
+        except FileNotFoundError:
+            file.parent.mkdir(exist_ok=True)
+            _overwrite(file, crumb.model_dump_json().encode())
+        except OSError:
+            file.unlink(missing_ok=True)
+            raise
+
+    def open_fault_log(self) -> IO[bytes]:
+        """A file for the last words of this process, as `faulthandler` writes them.
+
+        Raises:
+            UsageError: there is no private folder on this machine, for a store in a bucket.
+            OSError: the file cannot be written.
+        """
+        file = self._file(process_name(), _FAULT)
+        file.parent.mkdir(exist_ok=True)
+        return os.fdopen(_open(file, os.O_TRUNC), "wb", buffering=0)
+
+    def crumb_of(self, process: str) -> Crumb | None:
+        """What a process does, or did when it ended; None if it left no breadcrumb, or half of one."""
+        try:
+            return Crumb.model_validate_json(self._read_crumb(process))
+        except ValidationError:
+            return None
+
+    def crumbs(self) -> dict[str, Crumb]:
+        """What each process does that has not been forgotten, by its name."""
+        names = _place(self.url).names(UNDERWAY_FOLDER) if self.url else sorted(file.name for file in self._files())
+        processes = [name.removesuffix(_CRUMB) for name in names if name.endswith(_CRUMB)]
+        found = {process: self.crumb_of(process) for process in processes}
+        return {process: crumb for process, crumb in found.items() if crumb is not None}
+
+    def fault_of(self, process: str) -> str:
+        """Of what a process died, in one line; "" if nothing within it brought it about."""
+        return summary_of(self._read(process, _FAULT).decode(errors="replace"))
+
+    def forget(self, process: str) -> None:
+        """Remove what a process left."""
+        if self.url:
+            _place(self.url).remove(_key(process))
+        for suffix in (_CRUMB, _FAULT):
+            self._file(process, suffix).unlink(missing_ok=True)
+
+    def sweep(self) -> int:
+        """Remove what ended processes left, as far as that can be told; returns how many files that was."""
+        crumbs = [process for process in self.crumbs() if is_gone(process)] if self.url else []
+        files = [file for file in self._files() if is_abandoned(file, file.stem, _ABANDONED_S)]
+        for process in crumbs:
+            _place(self.url).remove(_key(process))
+        for file in files:
+            file.unlink(missing_ok=True)
+        return len(crumbs) + len(files)
+
+    def _home(self) -> Path:
+        """The folder of this machine's files."""
+        if self.folder is not None:
+            return self.folder
+        return private_folder(f"{UNDERWAY_FOLDER}-{hashlib.sha256(self.url.encode()).hexdigest()[:16]}")
+
+    def _files(self) -> list[Path]:
+        home = self._home()
+        return list(home.iterdir()) if home.is_dir() else []
+
+    def _file(self, process: str, suffix: str) -> Path:
+        # Not `with_suffix`: a host's name may hold dots.
+        return self._home() / f"{process}{suffix}"
+
+    def _read_crumb(self, process: str) -> bytes:
+        if not self.url:
+            return self._read(process, _CRUMB)
+        try:
+            return _place(self.url).read(_key(process), _MAX_BYTES)
+        except StoreError:
+            return b""
+
+    def _read(self, process: str, suffix: str) -> bytes:
+        try:
+            return read_bounded(self._file(process, suffix), _MAX_BYTES)
+        except StoreError:
+            return b""
+
+
+def workers_at_work(url: str, now: float) -> list[str]:
+    """Processes that leave breadcrumbs in a bucket and have not ended, as far as that can be told from here.
+
+    Args:
+        url: of the store.
+        now: seconds since 1970.
+    """
+    crumbs = Underway(Path(), url).crumbs()
+    return [name for name, crumb in crumbs.items() if not is_gone(name) and now - crumb.written < _WORKER_SILENT_S]
+
+
+@cache
+def _place(url: str) -> "Place":
+    """A bucket, whose client cannot travel between processes."""
+    from shared.store.backends.base import place_of
+
+    return place_of(url)
+
+
+def _key(process: str) -> str:
+    """Of a breadcrumb, in a bucket."""
+    return f"{UNDERWAY_FOLDER}/{process}{_CRUMB}"
+
+
+def _overwrite(file: Path, data: bytes) -> None:
+    """Put a breadcrumb in the place of the last one."""
+    # Neither truncated nor renamed over: file systems take either for a wish to have it on the disk at once, which
+    # costs milliseconds. Blanks cover what was there before, and JSON ignores them.
+    assert len(data) <= _CRUMB_BYTES
+    descriptor = _open(file)
+    try:
+        os.write(descriptor, data.ljust(_CRUMB_BYTES))
+    finally:
+        os.close(descriptor)
+
+
+def _open(file: Path, flags: int = 0) -> int:
+    """Open a file of this process to write: others may write to a store, and a link could lead anywhere."""
+    # A pipe in its place would block for ever.
+    flags |= os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    return os.open(file, flags, 0o644)
+
+
+def summary_of(words: str) -> str:
+    """What `faulthandler` wrote, in one line of bounded length: what happened, and the innermost frames."""
+    if not words.strip():
+        return ""
+    first = " ".join(words.strip().splitlines()[0].split())[:200]
+    timeout = _TIMEOUT.fullmatch(first)
+    what = f"took more than {timeout['limit']}" if timeout else first.removeprefix("Fatal Python error: ")
+    # After a timeout every thread has a section; the main thread's, which executes jobs, comes last.
+    section = words.rpartition("(most recent call first):")[2]
+    frames = [match for line in section.splitlines() if (match := _FRAME.fullmatch(line))][:_FRAMES]
+    places = [f"{frame['function'][:60]} ({Path(frame['file']).name[:60]}:{frame['line']})" for frame in frames]
+    return f"{what}, in {' of '.join(places)}" if places else what
