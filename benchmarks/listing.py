@@ -17,7 +17,7 @@ from shared.plan import Job, missing_ranges
 from shared.progress import Advance
 from shared.records import RolloutRecord
 from shared.store import Store
-from shared.store.codecs.checksummed import seal
+from shared.store.codecs.checksummed import with_checksum
 from shared.store.layout import MANIFEST_FILE
 
 COMMITS = 7
@@ -86,7 +86,7 @@ class ListingBenchmark:
             job = self._job(number)
             folder = self._store.shards_folder / job.shard_id
             folder.mkdir(parents=True)
-            (folder / MANIFEST_FILE).write_bytes(seal(content | {"start": job.start, "stop": job.stop}))
+            (folder / MANIFEST_FILE).write_bytes(with_checksum(content | {"start": job.start, "stop": job.stop}))
 
     def _measure(self, size: int) -> StorePoint:
         process = psutil.Process()

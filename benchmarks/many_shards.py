@@ -36,7 +36,7 @@ def _resume(store: Store) -> None:
 
 # Compaction comes last: it changes the store.
 COMMANDS: dict[str, Callable[[Store, Path, Progress], object]] = {
-    "status": lambda store, out, progress: read_status(store.place),
+    "status": lambda store, out, progress: read_status(store.backend),
     "collect (start)": lambda store, out, progress: _resume(store),
     "digest": lambda store, out, progress: store.digest(),
     "info": lambda store, out, progress: info(store),

@@ -1,4 +1,4 @@
-"""How a fleet's driver scales: its processor time and memory by number of actors, with actors that sleep.
+"""How a worker group's driver scales: its processor time and memory by number of actors, with actors that sleep.
 
 What is measured is fitted by two lines: processor time of the driver for a shard by the length of a job, and listing of
 a store by shards. These say what more actors and more interactions would take. Why by the length of a job: all that the
@@ -26,15 +26,15 @@ from benchmarks.script import check_picture, main
 from benchmarks.sleeping import Dormitories, Sleeper
 from cluster.cli.commands.bench import StoredSettings, source_of, stored
 from cluster.collection.tally import CollectionProgress
-from cluster.workers.job_queue import Series
-from cluster.workers.ray_group import RayFleet
+from cluster.workers.job_queue import RolloutQueue
+from cluster.workers.ray_group import RayWorkerGroup
 from cluster.workers.session import ray_session
-from collector.job_result import Receipt
+from collector.job_result import JobResult
 from collector.watchdog import Limits
 from shared.errors import UsageError
 from shared.plan import Plan
 from shared.progress import Advance, Progress
-from shared.store.crash_log import Underway
+from shared.store.crash_log import CrashLog
 
 BEDS = 100
 """Of a dormitory."""
@@ -47,7 +47,7 @@ SERVERS = ("gcs_server", "raylet")
 
 
 class ScaleSettings(StoredSettings):
-    """Serve fleets of actors that sleep, and made-up stores; predict what many more of both would take."""
+    """Serve worker groups of actors that sleep, and made-up stores; predict what many more of both would take."""
 
     rollouts: int = Field(4, ge=1, le=4096)
     """Of the store that is made where none is given, whose first shard is the pattern of a large store."""
@@ -56,9 +56,9 @@ class ScaleSettings(StoredSettings):
     processes: tuple[Annotated[int, Field(ge=1, le=1000)], ...] = (10, 30)
     """Numbers of sleeping actors with a process each, as collectors have: about 100 MB."""
     shards_per_s: float = Field(50.0, gt=0, le=10_000)
-    """That each fleet makes: jobs sleep the longer, the more actors there are."""
+    """That each worker group makes: jobs sleep the longer, the more actors there are."""
     seconds: float = Field(30.0, gt=0, le=3600)
-    """Of each fleet."""
+    """Of each worker group."""
     shards: tuple[Annotated[int, Field(ge=1, le=10_000_000)], ...] = (1000, 10_000, 100_000)
     """Numbers of shards of a store on a disk that is made up, listed and added to; in order."""
     predict_actors: int = Field(10_000, ge=1)
@@ -82,17 +82,17 @@ def measure(command: ScaleSettings) -> dict[str, Any]:
     with stored(command) as source, TemporaryDirectory(prefix="adaafford-bench-") as scratch:
         result: dict[str, Any] = source_of(command, source)
         sizes = command.actors, command.processes
-        fleets = FleetBenchmark(source.plans()[0], *sizes, command.shards_per_s, command.seconds)
-        with Progress("fleets of sleeping actors", fleets.turns) as progress:
-            fleets.run(progress.advance)
+        worker_groups = FleetBenchmark(source.plans()[0], *sizes, command.shards_per_s, command.seconds)
+        with Progress("worker groups of sleeping actors", worker_groups.turns) as progress:
+            worker_groups.run(progress.advance)
         listing = ListingBenchmark(source, Path(scratch) / "large", command.shards)
         with Progress("stores of made-up shards", listing.turns) as progress:
             listing.run(progress.advance)
         rollout = source.setting.collection.rollout.interactions
-    result |= {"fleets": [asdict(point) for point in fleets.points]}
+    result |= {"fleets": [asdict(point) for point in worker_groups.points]}
     result |= {"stores": [asdict(point) for point in listing.points]}
     wish = Wish(command.predict_actors, command.predict_interactions, rollout, command.interactions_per_s)
-    result |= predictions(fleets.points, listing.points, wish)
+    result |= predictions(worker_groups.points, listing.points, wish)
     _print(result)
     if command.figure is not None:
         from benchmarks.scaling_figure import draw
@@ -104,7 +104,7 @@ def measure(command: ScaleSettings) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class FleetPoint:
-    """A fleet that was kept busy with sleep.
+    """A worker group that was kept busy with sleep.
 
     Attributes:
         kind: "process", an actor a process, or "guest", many of them in one.
@@ -132,14 +132,14 @@ class FleetPoint:
 
 
 class FleetBenchmark:
-    """Fleets of several sizes, one after the other.
+    """Worker groups of several sizes, one after the other.
 
     Args:
         plan: handed out; as large as that of a real store, since it names all objects.
         guests: numbers of actors that share processes.
         processes: numbers of actors of a process each.
-        shards_per_s: of each fleet: jobs sleep the longer the more actors there are, as the driver would have it.
-        seconds: of each fleet.
+        shards_per_s: of each worker group: jobs sleep the longer the more actors there are, as the driver would have it.
+        seconds: of each worker group.
     """
 
     def __init__(
@@ -175,14 +175,14 @@ class FleetBenchmark:
             if kind == "guest":
                 call = Dormitories(-(-actors // BEDS), BEDS, job_s)
                 stack.callback(call.close)
-            underway = Underway(scratch / "underway")
+            crash_log = CrashLog(scratch / "underway")
             limits = Limits(rollout_s=max(300.0, 2 * job_s))
-            fleet = RayFleet(partial(Sleeper, job_s), underway, actors, limits, call)
-            stack.callback(fleet.close)
-            self._collect(fleet, 0, 2 * actors)
+            worker_group = RayWorkerGroup(partial(Sleeper, job_s), crash_log, actors, limits, call)
+            stack.callback(worker_group.close)
+            self._collect(worker_group, 0, 2 * actors)
             servers = _servers()
             begun, used, served = time.perf_counter(), time.process_time(), _cpu_s(servers)
-            memory = self._collect(fleet, 2 * actors, actors * each)
+            memory = self._collect(worker_group, 2 * actors, actors * each)
             wall_s, used_s, served_s = (
                 time.perf_counter() - begun,
                 time.process_time() - used,
@@ -202,18 +202,18 @@ class FleetBenchmark:
             growth_bytes=(half[-1] - half[0]) / max(LOOK_EVERY * (len(half) - 1), 1),
         )
 
-    def _collect(self, fleet: RayFleet, first: int, shards: int) -> list[int]:
-        """Hand out so many jobs, and take in receipts as a collection does; the driver's memory after every tenth."""
+    def _collect(self, worker_group: RayWorkerGroup, first: int, shards: int) -> list[int]:
+        """Hand out so many jobs, and take in job results as a collection does; the driver's memory after every tenth."""
         progress = CollectionProgress("", 0, PER_SHARD * shards, "")
         process, memory = psutil.Process(), []
 
-        def take(receipt: Receipt) -> None:
-            progress.tally.add(receipt)
+        def take(job_result: JobResult) -> None:
+            progress.tally.add(job_result)
             if progress.tally.rollouts % (LOOK_EVERY * PER_SHARD) == 0:
                 memory.append(process.memory_info().rss)
 
         rollouts = (PER_SHARD * first, PER_SHARD * (first + shards))
-        fleet.run(Series(lambda: self._plan, [rollouts], PER_SHARD), take)
+        worker_group.run(RolloutQueue(lambda: self._plan, [rollouts], PER_SHARD), take)
         return [*memory, process.memory_info().rss]
 
 
@@ -293,15 +293,15 @@ def predict(driver_ms: Line, start_s: Line, wish: Wish, per_shard: int) -> Predi
     return Prediction(per_shard, job_s, shards, rate, rate * each_s, start_s(shards), int(job_s / each_s))
 
 
-def predictions(fleets: Sequence[FleetPoint], stores: Sequence[StorePoint], wish: Wish) -> dict[str, Any]:
+def predictions(worker_groups: Sequence[FleetPoint], stores: Sequence[StorePoint], wish: Wish) -> dict[str, Any]:
     """The lines through what was measured, and what they say of some sizes of shards."""
-    guests = [point for point in fleets if point.kind == "guest"] or fleets
+    guests = [point for point in worker_groups if point.kind == "guest"] or worker_groups
     # A slope below zero is noise, and would make the large look cheap.
     driver_ms = Line.through((point.job_s, point.driver_ms) for point in guests)
     if driver_ms.slope < 0:
         driver_ms = Line(max(point.driver_ms for point in guests), 0.0)
     # An actor with a process has a connection of its own, which costs more than a share of one.
-    above = [point.driver_ms - driver_ms(point.job_s) for point in fleets if point.kind == "process"]
+    above = [point.driver_ms - driver_ms(point.job_s) for point in worker_groups if point.kind == "process"]
     driver_ms = Line(driver_ms.at_zero + max(0.0, float(np.mean(above or [0.0]))), driver_ms.slope)
     start_s = Line.through((point.shards, point.start_s) for point in stores)
     return {

@@ -19,7 +19,7 @@ def draw(result: dict[str, Any], before: dict[str, Any] | None, path: Path) -> N
 
     Args:
         result: of the benchmark.
-        before: an earlier one, whose fleets are drawn beside.
+        before: an earlier one, whose worker groups are drawn beside.
         path: the file.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -1,6 +1,6 @@
-"""Workers and actors that sleep instead of simulating: what a fleet costs its driver, and nothing else.
+"""Workers and actors that sleep instead of simulating: what a worker group costs its driver, and nothing else.
 
-Two kinds. `Sleeper` is a worker like any other, in a process of its own, with breadcrumbs and limits. Where more actors
+Two kinds. `Sleeper` is a worker like any other, in a process of its own, with heartbeats and limits. Where more actors
 are wanted than processes fit on a machine, `Dormitory` is one process that many actors live in: the driver sees as many
 actors, each with its own jobs in their order, and cannot tell the difference but by the processes' names.
 """
@@ -16,7 +16,7 @@ from typing import Any
 import ray
 
 from cluster.workers.ray_group import Actor
-from collector.job_result import Receipt
+from collector.job_result import JobResult
 from collector.watchdog import UnderWay
 from shared.io.files import process_name
 from shared.plan import Job, Plan
@@ -24,16 +24,16 @@ from shared.plan import Job, Plan
 INTERACTIONS = 32
 """Of a rollout, as by default."""
 STAGES = ("load", "settle", "observe", "propose", "simulate", "write")
-"""Named so that receipts are as large as those of a collector."""
+"""Named so that job results are as large as those of a collector."""
 
 
-def receipt_of(job: Job, slept_s: float) -> Receipt:
+def job_result_of(job: Job, slept_s: float) -> JobResult:
     """What a collector might have said of a job."""
     rollouts = job.stop - job.start
     each = INTERACTIONS // 4
     outcomes = dict.fromkeys(("ok", "no-contact", "start-collision", "wrong-part"), each * rollouts)
     seconds = {**dict.fromkeys(STAGES, slept_s / len(STAGES)), "total": slept_s}
-    return Receipt(job.shard_id, rollouts, INTERACTIONS * rollouts, each * rollouts, outcomes, seconds)
+    return JobResult(job.shard_id, rollouts, INTERACTIONS * rollouts, each * rollouts, outcomes, seconds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +45,14 @@ class Sleeper:
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """Sleepers propose nothing."""
 
-    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> Receipt:
-        """Sleep, and leave breadcrumbs as a collector does."""
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> JobResult:
+        """Sleep, and leave heartbeats as a collector does."""
         begun = time.perf_counter()
         for rollout in range(job.start, job.stop):
             under_way(rollout)
             time.sleep(self.job_s / (job.stop - job.start))
         under_way(None)
-        return receipt_of(job, time.perf_counter() - begun)
+        return job_result_of(job, time.perf_counter() - begun)
 
 
 class Dormitory:
@@ -66,12 +66,12 @@ class Dormitory:
         """Name of the actor in this bed, as of a process."""
         return f"{process_name()}{bed:05d}"
 
-    async def run(self, bed: int, job: Job, *rest: Any) -> Receipt:
+    async def run(self, bed: int, job: Job, *rest: Any) -> JobResult:
         """Sleep for a job."""
         begun = time.perf_counter()
         async with self._beds[bed]:
             await asyncio.sleep(self._job_s)
-        return receipt_of(job, time.perf_counter() - begun)
+        return job_result_of(job, time.perf_counter() - begun)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +86,10 @@ class _Guest:
         answer: Future[str] = self.dormitory.arrive.remote(self.bed).future()
         return answer
 
-    def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[Receipt]":
+    def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[JobResult]":
         """See `Actor.run`."""
         # All is sent that a worker would be sent, since that is part of what is measured.
-        answer: Future[Receipt] = self.dormitory.run.remote(self.bed, job, [plan], policy, quarantined).future()
+        answer: Future[JobResult] = self.dormitory.run.remote(self.bed, job, [plan], policy, quarantined).future()
         return answer
 
     def end(self) -> None:

@@ -143,10 +143,10 @@ class StoringBenchmark:
     def _read(self, name: str, store: Store, prepare: Callable[[], None]) -> None:
         prepare()
         decoded = _seconds(lambda: read_everything(store))
-        keys = store.place.leaves(SHARDS_FOLDER)
+        keys = store.backend.leaves(SHARDS_FOLDER)
         wanted = [(key, MAX_FILE_BYTES if key.count("/") > 1 else MAX_DOCUMENT_BYTES) for key in keys]
         prepare()
-        raw = _seconds(lambda: sum(map(len, store.place.read_all(wanted))))
+        raw = _seconds(lambda: sum(map(len, store.backend.read_all(wanted))))
         self.readings.setdefault(name, []).append(Reading(decoded, raw))
 
 

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 
 import ray
 
-from collector.job_result import JobWorker, Receipt, WorkerFactory
-from collector.watchdog import Guard, Limits
+from collector.job_result import JobResult, JobWorker, WorkerFactory
+from collector.watchdog import Limits, Watchdog
 from shared.io.files import process_name
 from shared.plan import Job, Plan
-from shared.store.crash_log import Underway
+from shared.store.crash_log import CrashLog
 
 
 class WorkerActor:
@@ -20,20 +20,20 @@ class WorkerActor:
 
     Args:
         make_worker: makes the worker.
-        underway: where breadcrumbs go.
+        crash_log: where heartbeats go.
         limits: what a rollout may take.
     """
 
-    def __init__(self, make_worker: WorkerFactory, underway: Underway, limits: Limits) -> None:
+    def __init__(self, make_worker: WorkerFactory, crash_log: CrashLog, limits: Limits) -> None:
         self._make_worker = make_worker
-        self._guard = Guard(underway, limits)
+        self._guard = Watchdog(crash_log, limits)
         self._worker: JobWorker | None = None
         self._broken = False
         self._plans: dict[str, Plan] = {}
         self._loaded: set[int] = set()
 
     def arrive(self) -> str:
-        """Return this process's name, by which its breadcrumbs go; which also says that it is up."""
+        """Return this process's name, by which its heartbeats go; which also says that it is up."""
         self._guard.stand()
         return process_name()
 
@@ -43,8 +43,8 @@ class WorkerActor:
         job: Job,
         policy: "list[ray.ObjectRef[Mapping[str, bytes]]]",
         quarantined: Mapping[int, str],
-    ) -> Receipt:
-        """Execute `job` and return its receipt; arrays never cross.
+    ) -> JobResult:
+        """Execute `job` and return its job result; arrays never cross.
 
         Args:
             plan: the reference to the plan that the job belongs to, within a list so that Ray hands over the reference
@@ -53,7 +53,7 @@ class WorkerActor:
             policy: likewise to the weights of the plan's policy; empty if it uses none.
             quarantined: rollouts of the job that are not to be executed, and why.
         """
-        # The job behind one that failed is here already, and would hide its breadcrumb before the driver has seen it.
+        # The job behind one that failed is here already, and would hide its heartbeat before the driver has seen it.
         if self._broken:
             raise RuntimeError("the job before this one failed, and the process is about to be replaced")
         self._broken = True
@@ -62,9 +62,9 @@ class WorkerActor:
             worker.load_policy(known.policy_version, ray.get(policy[0]))
             self._loaded.add(known.policy_version)
         with self._guard.job(job) as under_way:
-            receipt = worker.run(known, job, quarantined, under_way)
+            job_result = worker.run(known, job, quarantined, under_way)
         self._broken = False
-        return receipt
+        return job_result
 
     def _plan(self, key: str, ref: "ray.ObjectRef[Plan]") -> Plan:
         """The plan of this name, pulled if it is not here."""

@@ -9,7 +9,7 @@ from shared.plan import Job, Plan
 
 
 @dataclass(frozen=True, slots=True)
-class Receipt:
+class JobResult:
     """What came of a job: counts and times, never data.
 
     Attributes:
@@ -42,10 +42,10 @@ class JobWorker(Protocol):
         """Make the policy `version` ready for plans that use it."""
         ...
 
-    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> Receipt:
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> JobResult:
         """Execute and commit `job`; do nothing if that was done before. See `collector.worker.Worker.run`."""
         ...
 
 
 WorkerFactory = Callable[[], JobWorker]
-"""Makes a worker in the process that will use it; must be picklable for a fleet of processes."""
+"""Makes a worker in the process that will use it; must be picklable for a worker group of processes."""

@@ -1,4 +1,4 @@
-"""What a process that executes rollouts owes those who depend on it: breadcrumbs, last words, and bounds.
+"""What a process that executes rollouts owes those who depend on it: heartbeats, crash log, and bounds.
 
     guard = Guard(underway, limits)
     guard.stand()                              # once, before anything that could crash
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import psutil
 
 from shared.plan import Job
-from shared.store.crash_log import Crumb, Underway
+from shared.store.crash_log import CrashLog, Heartbeat
 
 UnderWay = Callable[[int | None], None]
 """Called with a rollout's number before it is executed, and with None when none is under way."""
@@ -39,22 +39,22 @@ class Limits:
     memory_mb: float = 2000.0
 
 
-class Guard:
+class Watchdog:
     """Stands over this process, which does nothing else than execute jobs.
 
     Args:
-        underway: where breadcrumbs and last words go.
+        crash_log: where heartbeats and crash log go.
         limits: what a rollout may take.
     """
 
-    def __init__(self, underway: Underway, limits: Limits) -> None:
-        self._underway = underway
+    def __init__(self, crash_log: CrashLog, limits: Limits) -> None:
+        self._crash_log = crash_log
         self._limits = limits
 
     def stand(self) -> None:
         """Write down crashes from now on."""
         # Kept open, since a handler of signals cannot open files.
-        self._log = self._underway.open_fault_log()
+        self._log = self._crash_log.open_fault_log()
         faulthandler.enable(self._log, all_threads=False)
 
     def bound_memory(self) -> None:
@@ -70,10 +70,10 @@ class Guard:
 
     @contextmanager
     def job(self, job: Job) -> Iterator[UnderWay]:
-        """Gives what to call before each rollout of a job; the last breadcrumb stays, as it is overwritten anyway."""
+        """Gives what to call before each rollout of a job; the last heartbeat stays, as it is overwritten anyway."""
 
         def under_way(rollout: int | None) -> None:
-            self._underway.leave(Crumb(shard_id=job.shard_id, rollout=rollout, written=time.time()))
+            self._crash_log.leave(Heartbeat(shard_id=job.shard_id, rollout=rollout, written=time.time()))
             faulthandler.dump_traceback_later(self._limits.rollout_s, exit=True, file=self._log)
 
         try:

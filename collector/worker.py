@@ -11,7 +11,7 @@ import numpy as np
 import psutil
 
 from collector.domain_randomisation import object_of
-from collector.job_result import Receipt
+from collector.job_result import JobResult
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.cache import ObjectCache
 from collector.random_proposer import RandomProposer
@@ -47,7 +47,7 @@ class Worker:
 
     def __init__(self, store: str | Path, objects: Path) -> None:
         self._store = Store.open(store)
-        note_machine(self._store.place)
+        note_machine(self._store.backend)
         self._folder = objects
         self._objects = ObjectCache(objects)
         self._adapters: dict[int, Adapter] = {}
@@ -64,7 +64,7 @@ class Worker:
         job: Job,
         quarantined: Mapping[int, str] = NOTHING,
         under_way: UnderWay = lambda rollout: None,
-    ) -> Receipt:
+    ) -> JobResult:
         """Execute a job's rollouts and commit its shard; do nothing if it is committed already.
 
         Args:
@@ -76,7 +76,7 @@ class Worker:
         begun = time.perf_counter()
         clock = StageClock()
         if self._store.holds(job):
-            return _receipt(job, self._store.read_rollouts(job.shard_id), {"total": time.perf_counter() - begun})
+            return _job_result(job, self._store.read_rollouts(job.shard_id), {"total": time.perf_counter() - begun})
         records = []
         for index in range(job.start, job.stop):
             if index in quarantined:
@@ -92,11 +92,11 @@ class Worker:
             # Beside the version in each row this says how far that was behind, where collection follows a learner.
             provenance["newest_policy"] = str(max(self._store.policy_versions(), default=0))
         # A driver holds a store on a disk alone, and has seen what is missing; of a bucket there may be several.
-        vetted = not self._store.place.writes_in_place
+        vetted = not self._store.backend.writes_in_place
         with clock.stage("write"):
             self._store.commit(plan, job, records, provenance, self._explain(job, quarantined), vetted=vetted)
         clock.seconds["total"] = time.perf_counter() - begun
-        return _receipt(job, records, dict(clock.seconds))
+        return _job_result(job, records, dict(clock.seconds))
 
     def execute(self, plan: Plan, index: int, clock: StageClock) -> RolloutRecord:
         """Execute one rollout, and commit nothing.
@@ -144,9 +144,9 @@ def _empty(records: Sequence[RolloutRecord]) -> dict[str, dict[str, int]]:
     return counts
 
 
-def _receipt(job: Job, records: Sequence[RolloutRecord], seconds: dict[str, float]) -> Receipt:
+def _job_result(job: Job, records: Sequence[RolloutRecord], seconds: dict[str, float]) -> JobResult:
     outcomes = [row.outcome for record in records for row in record.interactions]
-    return Receipt(
+    return JobResult(
         shard_id=job.shard_id,
         rollouts=len(records),
         interactions=len(outcomes),

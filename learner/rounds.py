@@ -27,7 +27,7 @@ from shared.errors import StoreError
 from shared.io.documents import read_document
 from shared.io.files import read_bounded, write_atomically
 from shared.policies.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
-from shared.store.backends.base import place_of
+from shared.store.backends.base import backend_of
 from shared.store.layout import MAX_DOCUMENT_BYTES, SHARDS_FOLDER, STORE_FILE, parse_shard_id
 from shared.store.policies import MAX_VERSION, version_of
 from shared.store.snapshot import Snapshot
@@ -104,7 +104,7 @@ class Following(Finished):
         return self.out / f"data-{number}.json"
 
     def _wait_for_store(self, where: str | Path) -> None:
-        place, said = place_of(where), False
+        place, said = backend_of(where), False
         while not (place.is_there() and place.exists(STORE_FILE)):
             if not said and data_parallel.rank() == 0:
                 print(f"waiting for a store in {where}", flush=True)
@@ -140,7 +140,7 @@ class Following(Finished):
 
     def _at_most(self) -> int:
         """The most rollouts that the store can hold, by the names of its shards alone: cheap, so it is asked first."""
-        jobs = [parse_shard_id(name) for name in self._store.place.names(SHARDS_FOLDER)]
+        jobs = [parse_shard_id(name) for name in self._store.backend.names(SHARDS_FOLDER)]
         return sum(job.stop - job.start for job in jobs if job is not None)
 
 
@@ -167,7 +167,7 @@ def publish(store: Store, out: Path, name: str, policy: Path) -> int | None:
     noted = versions.get(name)
     if noted is None:
         # The record may be lost, or the same learner be started twice: then the policy is there already.
-        noted = version_of(store.place, files, besides=versions.values())
+        noted = version_of(store.backend, files, besides=versions.values())
     elif noted in taken and store.read_policy(noted) != files:
         # Another learner took the version after it was noted and before this process was killed.
         noted = None

@@ -1,7 +1,7 @@
 """The campaign: the alternation over one folder, from the choice of objects to the report.
 
     objects, collect-random, train-prior,
-    train-aap-1, train-aip-1, publish-1,        (a run that starts from a policy has `adopt` for the three trainings)
+    train-aap-1, train-aip-1, publish-1,        (a run that starts from a policy has `warm_start` for the three trainings)
     collect-aip-1, train-aap-2, train-aip-2, publish-2, ...
     (before the last publication train-where2act-interaction, train-where2act-adaptation, where they are evaluated)
     evaluate, report
@@ -23,10 +23,10 @@ from cluster.config.campaign_config import CampaignConfig
 from cluster.config.objects import lists_of, objects_for, split_as_told
 from cluster.evaluation.evaluate import Evaluation, figures_of
 from cluster.runs.run_folder import ObjectsUsed, RunFolder
-from cluster.runs.run_log import Ledger
+from cluster.runs.run_log import RunLog
 from cluster.runs.subprocesses import THREADS, Child
-from cluster.runs.warm_start import adopt, fit_to_start_from, seen_by, unknown
-from cluster.workers.session import Crew, fleets
+from cluster.runs.warm_start import fit_to_start_from, seen_by, unknown, warm_start
+from cluster.workers.session import Crew, worker_groups
 from collector.setting import make_setting, packages_used
 from learner.alternation import AlternationStep, Collect, Publish, alternation, perform
 from learner.settings import LearnerConfig
@@ -77,14 +77,14 @@ class Campaign:
         """
         run, config, steps = self._run, self._config, steps_of(self._config)
         with exclusive_lock(run.path / DRIVER_LOCK), closing(self._learner):
-            ledger = Ledger(run.log)
-            ledger.note("attempt", workers=config.workers, software=software_versions())
+            run_log = RunLog(run.log)
+            run_log.note("attempt", workers=config.workers, software=software_versions())
             changed = changed_versions(run.begun_with())
-            if changed and any(step.name not in ledger.finished for step in steps):
+            if changed and any(step.name not in run_log.finished for step in steps):
                 self._say(f"begun with other software: {changed}; what is made from here on may differ by it")
-            with fleets(config.workers, config.limits, config.ray_address) as make_fleet:
-                self._crew = Crew(make_fleet)
-                ledger.run({step.name: partial(self._do, step) for step in steps}, self._say)
+            with worker_groups(config.workers, config.limits, config.ray_address) as make_worker_group:
+                self._crew = Crew(make_worker_group)
+                run_log.run({step.name: partial(self._do, step) for step in steps}, self._say)
             from cluster.reporting.report import print_report
 
             print_report(run)
@@ -95,7 +95,7 @@ class Campaign:
                 return self._choose_objects()
             case "adopt":
                 assert self._config.start_from is not None, "the run starts from a policy"
-                adopt(self._config.start_from, self._config.task, self._run.adopted)
+                warm_start(self._config.start_from, self._config.task, self._run.adopted)
                 return {"policy_folder": str(self._run.adopted.relative_to(self._run.path))}
             case "evaluate":
                 return self._evaluate()
@@ -109,8 +109,8 @@ class Campaign:
         plan = Plan(setting=store.setting, proposer=step.proposer, policy_version=step.version)
         wanted = rollouts.of_round(step.version, len(store.setting.objects))
         with store.only_driver():
-            open_fleet = partial(self._crew.for_store, store, folder)
-            collected = collect(store, plan, wanted, rollouts.per_shard, open_fleet, folder)
+            open_worker_group = partial(self._crew.for_store, store, folder)
+            collected = collect(store, plan, wanted, rollouts.per_shard, open_worker_group, folder)
         return figures_of(collected)
 
     def job(self, number: int) -> StageJob:

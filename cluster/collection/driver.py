@@ -1,4 +1,4 @@
-"""Drives collection over a fleet: what is committed stays, what is missing is done, and nothing is done twice."""
+"""Drives collection over a worker group: what is committed stays, what is missing is done, and nothing is done twice."""
 
 import logging
 import time
@@ -9,10 +9,10 @@ from pathlib import Path
 
 from cluster.collection.status_writer import DriverStatus, State, status_kept
 from cluster.collection.tally import CollectionProgress, Tally, describe_empty
-from cluster.workers.job_queue import Series
-from cluster.workers.policy_source import PlanInForce
+from cluster.workers.job_queue import RolloutQueue
+from cluster.workers.policy_source import PolicySource
 from cluster.workers.retries import JobError
-from cluster.workers.worker_group import Fleet
+from cluster.workers.worker_group import WorkerGroup
 from shared.errors import WorkerError
 from shared.io.files import process_name
 from shared.plan import Plan, covered, missing_ranges, parse_plan_key
@@ -20,7 +20,7 @@ from shared.reproduction import reproduction
 from shared.store import Store, reopen_quarantined
 from shared.store.maintenance.info import quarantined_in
 
-OpenFleet = Callable[[], Fleet]
+OpenFleet = Callable[[], WorkerGroup]
 
 MOST_REPORTED = 10
 """Quarantined rollouts that a collection prints; a store that is all wrong would print thousands."""
@@ -62,7 +62,7 @@ def collect(
     plan: Plan | Newest,
     rollouts: int,
     per_shard: int,
-    open_fleet: OpenFleet,
+    open_worker_group: OpenFleet,
     objects: Path,
     *,
     retry_quarantined: bool = False,
@@ -75,7 +75,7 @@ def collect(
         rollouts: how many the store shall hold of this plan, or of this proposer with any policy, those of earlier
             attempts included.
         per_shard: rollouts a shard.
-        open_fleet: gives the fleet; not called if nothing is left to do.
+        open_worker_group: gives the worker group; not called if nothing is left to do.
         objects: folder of the objects, for the command that reproduces a failed job.
         retry_quarantined: whether rollouts that were quarantined are executed again.
 
@@ -99,15 +99,15 @@ def collect(
         if not missing:
             _require_interactions(store, plan)
             return Collected(progress.tally, 0.0, 0)
-        fleet = open_fleet()
+        worker_group = open_worker_group()
         version, per_version = (plan.policy_version, None) if isinstance(plan, Plan) else (None, plan.per_version)
-        in_force = PlanInForce(store, plan.proposer, version, _Adopting(store, fleet))
+        in_force = PolicySource(store, plan.proposer, version, _Adopting(store, worker_group))
         counts = {key: covered(ranges) for key, ranges in held.items()}
-        series = Series(in_force, missing, per_shard, per_version, counts)
-        standing = _Standing(plan.key, already, rollouts, progress, fleet, in_force)
+        series = RolloutQueue(in_force, missing, per_shard, per_version, counts)
+        snapshot = _Standing(plan.key, already, rollouts, progress, worker_group, in_force)
         try:
-            with status_kept(store.place, standing, lambda: series.waiting, progress.say):
-                fleet.run(series, progress)
+            with status_kept(store.backend, snapshot, lambda: series.waiting, progress.say):
+                worker_group.run(series, progress)
         except JobError as error:
             command = reproduction(store.where, error.job.shard_id, objects)
             raise WorkerError(f"{error}; reproduce it with: {command}") from None
@@ -115,7 +115,7 @@ def collect(
         _report_quarantined(store, plan, objects)
     if not progress.tally.interactions:
         _require_interactions(store, plan)
-    return Collected(progress.tally, progress.elapsed_s, fleet.workers)
+    return Collected(progress.tally, progress.elapsed_s, worker_group.workers)
 
 
 def _plan_keys(store: Store, plan: Plan | Newest) -> list[str]:
@@ -131,11 +131,11 @@ class _Adopting:
     """Makes a plan known to the store, and its policy to the workers."""
 
     store: Store
-    fleet: Fleet
+    worker_group: WorkerGroup
 
     def __call__(self, plan: Plan) -> None:
         if plan.policy_version:
-            self.fleet.load_policy(plan.policy_version, self.store.read_policy(plan.policy_version))
+            self.worker_group.load_policy(plan.policy_version, self.store.read_policy(plan.policy_version))
         self.store.add_plan(plan)
         logger.info("plan %s is in force", plan.key, extra={"plan": plan.key})
 
@@ -148,8 +148,8 @@ class _Standing:
     already: int
     total: int
     progress: CollectionProgress
-    fleet: Fleet
-    in_force: PlanInForce
+    worker_group: WorkerGroup
+    in_force: PolicySource
 
     def __call__(self, state: State) -> DriverStatus:
         tally, plan = self.progress.tally, self.in_force.plan
@@ -168,8 +168,8 @@ class _Standing:
             outcomes=dict(tally.outcomes),
             quarantined=tally.quarantined,
             recent_per_s=self.progress.recent_per_s,
-            workers=self.fleet.workers,
-            restarts=self.fleet.restarts,
+            workers=self.worker_group.workers,
+            restarts=self.worker_group.restarts,
         )
 
 

@@ -17,7 +17,7 @@ from shared.config import StrictModel
 from shared.errors import StoreError
 from shared.heartbeat import Heartbeat
 from shared.io.files import is_gone
-from shared.store.backends.base import Place
+from shared.store.backends.base import StorageBackend
 from shared.store.layout import STATUS_FOLDER
 
 BEAT_S = 2.0
@@ -93,7 +93,7 @@ class DriverStatus(StrictModel):
         return not ended and now - self.written < SILENT_S
 
 
-def read_status(place: Place) -> DriverStatus | None:
+def read_status(place: StorageBackend) -> DriverStatus | None:
     """How the last collection into a store stands; None where none has said so, or what it said is damaged."""
     try:
         if not place.exists(_KEY):
@@ -105,7 +105,7 @@ def read_status(place: Place) -> DriverStatus | None:
 
 @contextmanager
 def status_kept(
-    place: Place,
+    place: StorageBackend,
     stand: Callable[[State], DriverStatus],
     is_waiting: Callable[[], bool],
     say: Callable[[str], None],

@@ -1,4 +1,4 @@
-"""Progress of a collection: what its receipts add up to, and how that is shown."""
+"""Progress of a collection: what its job results add up to, and how that is shown."""
 
 import time
 from collections import deque
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from shared.progress import Progress
 
 if TYPE_CHECKING:
-    from collector.job_result import Receipt
+    from collector.job_result import JobResult
 
 RECENT_S = 30.0
 """What a rate counts as recent."""
@@ -28,7 +28,7 @@ EMPTY = {
 
 @dataclass(slots=True)
 class Tally:
-    """What receipts add up to, of this attempt alone."""
+    """What job results add up to, of this attempt alone."""
 
     rollouts: int = 0
     interactions: int = 0
@@ -43,21 +43,21 @@ class Tally:
     memory_mb: float = 0.0
     """Of the largest worker."""
 
-    def add(self, receipt: "Receipt") -> None:
-        """Count one receipt."""
-        self.rollouts += receipt.rollouts
-        self.interactions += receipt.interactions
-        self.successes += receipt.successes
-        for name, count in receipt.outcomes.items():
+    def add(self, job_result: "JobResult") -> None:
+        """Count one job result."""
+        self.rollouts += job_result.rollouts
+        self.interactions += job_result.interactions
+        self.successes += job_result.successes
+        for name, count in job_result.outcomes.items():
             self.outcomes[name] = self.outcomes.get(name, 0) + count
-        for name, seconds in receipt.seconds.items():
+        for name, seconds in job_result.seconds.items():
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
-        self.quarantined += receipt.quarantined
-        for status, objects in receipt.empty.items():
+        self.quarantined += job_result.quarantined
+        for status, objects in job_result.empty.items():
             of_status = self.empty.setdefault(status, {})
             for name, count in objects.items():
                 of_status[name] = of_status.get(name, 0) + count
-        self.memory_mb = max(self.memory_mb, receipt.memory_mb)
+        self.memory_mb = max(self.memory_mb, job_result.memory_mb)
 
     @property
     def success_rate(self) -> float:
@@ -66,7 +66,7 @@ class Tally:
 
 
 class CollectionProgress(Progress):
-    """Shows how far a collection is; use as a context and call with each receipt.
+    """Shows how far a collection is; use as a context and call with each job result.
 
     Args:
         title: of the plan.
@@ -83,7 +83,7 @@ class CollectionProgress(Progress):
         self.tally = Tally()
         self._already = done
         self._recent: deque[tuple[float, int]] = deque(maxlen=MAX_RECENT)
-        """When receipts came, and of how many interactions."""
+        """When job results came, and of how many interactions."""
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -93,17 +93,17 @@ class CollectionProgress(Progress):
             empty = describe_empty(self.tally.empty)
             self.say("; ".join([f"{self.title}: {self.describe()}", *([empty] if empty else [])]))
 
-    def __call__(self, receipt: "Receipt") -> None:
-        """Take in one receipt."""
-        self.tally.add(receipt)
-        self._recent.append((self._clock(), receipt.interactions))
+    def __call__(self, job_result: "JobResult") -> None:
+        """Take in one job result."""
+        self.tally.add(job_result)
+        self._recent.append((self._clock(), job_result.interactions))
         self.show(self._already + self.tally.rollouts)
 
     @property
     def recent_per_s(self) -> float:
         """Interactions a second of late."""
         now = self._clock()
-        # A copy, since another thread may ask while receipts come in.
+        # A copy, since another thread may ask while job results come in.
         recent = [(moment, count) for moment, count in self._recent.copy() if now - moment < RECENT_S]
         since = self._recent[0][0] if len(self._recent) == MAX_RECENT else now - RECENT_S
         return sum(count for _, count in recent) / max(now - max(self._begun, since), 1e-9)

@@ -71,8 +71,8 @@ class Evaluation:
             raise UsageError(f"{self.store.where}: holds trials of another policy ({others[0]}); name another folder")
         self._publish()
         with self.store.only_driver():
-            open_fleet = partial(crew.for_store, self.store, self.objects)
-            collected = collect(self.store, plan, self.rollouts, self.per_shard, open_fleet, self.objects)
+            open_worker_group = partial(crew.for_store, self.store, self.objects)
+            collected = collect(self.store, plan, self.rollouts, self.per_shard, open_worker_group, self.objects)
             crew.dismiss()
             told = {"store": self.store.where, "version": self.version, "out": str(self.out), "aap": str(self.oracle)}
             with closing(Child(say, Path(self.policies.where).parent)) as child:
@@ -91,5 +91,5 @@ class Evaluation:
 
 
 def figures_of(collected: Collected) -> Mapping[str, Any]:
-    """What a ledger notes of a collection: of the last attempt alone, as the wall time is."""
+    """What a run log notes of a collection: of the last attempt alone, as the wall time is."""
     return {"tally": asdict(collected.tally), "wall_s": collected.seconds, "workers": collected.workers}

@@ -23,10 +23,10 @@ def write_judgement(store: str, version: int, out: str, aap: str) -> None:
         out: folder of the table.
         aap: folder of the training that may have left an oracle; without one the table lacks its row.
     """
-    write_tables(Path(out), judge(Store.open(store), version, Path(aap) / ORACLE_FILE))
+    write_tables(Path(out), evaluate_policy(Store.open(store), version, Path(aap) / ORACLE_FILE))
 
 
-def judge(store: Store, version: int, oracle: Path) -> EvaluationTable:
+def evaluate_policy(store: Store, version: int, oracle: Path) -> EvaluationTable:
     """The table, a row for each method and budget.
 
     Args:

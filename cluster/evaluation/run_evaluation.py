@@ -13,7 +13,7 @@ from cluster.evaluation.evaluate import Evaluation
 from cluster.evaluation.tables import MARKDOWN_FILE, RESULTS_FILE
 from cluster.runs.run_folder import ObjectsUsed, RunFolder, find
 from cluster.runs.warm_start import seen_by
-from cluster.workers.session import Crew, fleets
+from cluster.workers.session import Crew, worker_groups
 from collector.setting import make_setting
 from collector.watchdog import Limits
 from shared.errors import UsageError
@@ -69,8 +69,8 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
 def _execute(evaluation: Evaluation, settings: EvaluateSettings) -> None:
     console = Console(file=sys.stderr, highlight=False)
     limits = Limits(settings.rollout_limit_s, settings.memory_limit_mb)
-    with fleets(settings.workers, limits, settings.ray_address) as make_fleet:
-        evaluation.execute(Crew(make_fleet), lambda line: console.print(line, markup=False, soft_wrap=True))
+    with worker_groups(settings.workers, limits, settings.ray_address) as make_worker_group:
+        evaluation.execute(Crew(make_worker_group), lambda line: console.print(line, markup=False, soft_wrap=True))
 
 
 def _version(run: RunFolder, policies: Store, wanted: int | None) -> int:

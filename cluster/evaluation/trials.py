@@ -14,14 +14,14 @@ from shared.types import Interaction, Observation, Role
 
 TOLD: MethodName = "ours-final"
 """The method whose episodes pictures show."""
-MOST_EPISODES = 60
+MOST_TRIALS = 60
 """Looked at for pictures, at the most: each holds all clouds of its rollout, some megabytes."""
 CANDIDATES = 40
 """Episodes among them that are asked for what their tries changed."""
 
 
 @dataclass(frozen=True, slots=True)
-class Episode:
+class EvaluationTrial:
     """What one method did with one object.
 
     Attributes:
@@ -48,12 +48,12 @@ class Episode:
         return self.history[: exploit.budget]
 
 
-def first_episodes(evaluation: Store, most: int = MOST_EPISODES) -> list[Episode]:
-    """The first episodes of the method that pictures show; raises as `episodes` does."""
-    return list(islice(episodes(evaluation, TOLD), most))
+def first_trials(evaluation: Store, most: int = MOST_TRIALS) -> list[EvaluationTrial]:
+    """The first episodes of the method that pictures show; raises as `trials` does."""
+    return list(islice(trials(evaluation, TOLD), most))
 
 
-def episodes(evaluation: Store, method: MethodName) -> Iterator[Episode]:
+def trials(evaluation: Store, method: MethodName) -> Iterator[EvaluationTrial]:
     """The episodes of a method that tried anything, in order.
 
     Raises:
@@ -64,17 +64,17 @@ def episodes(evaluation: Store, method: MethodName) -> Iterator[Episode]:
             own = [row for row in rollout.interactions if row.method == method]
             tries = tuple(row for row in own if row.role is Role.CONTEXT)
             if tries:
-                yield Episode(rollout, tries, tuple(row for row in own if row.role is Role.EXPLOIT))
+                yield EvaluationTrial(rollout, tries, tuple(row for row in own if row.role is Role.EXPLOIT))
 
 
-def most_telling(found: list[Episode], adapter: Adapter) -> Episode | None:
+def most_telling(found: list[EvaluationTrial], adapter: Adapter) -> EvaluationTrial | None:
     """The episode whose affordance its tries changed the most; None where there is none."""
-    return max(found[:CANDIDATES], key=lambda episode: _change(episode, adapter), default=None)
+    return max(found[:CANDIDATES], key=lambda trial: _change(trial, adapter), default=None)
 
 
-def _change(episode: Episode, adapter: Adapter) -> float:
+def _change(trial: EvaluationTrial, adapter: Adapter) -> float:
     """How much the tries changed the affordance of movable points; more where a try succeeded."""
-    history = episode.history
+    history = trial.history
     observation = history[0].observation
     before, after = adapter.affordance(observation, []), adapter.affordance(observation, history)
     moved = np.abs(after - before)[observation.movable]

@@ -10,7 +10,7 @@ from plotly.subplots import make_subplots
 
 from cluster.reporting.page import Cell, Drawing, Section, Table, plain, shortened
 from cluster.reporting.style import ACCENT, SECOND, laid_out
-from cluster.runs.run_log import Ledger
+from cluster.runs.run_log import RunLog
 from shared.store import Store
 from shared.store.layout import Quarantined
 from shared.store.maintenance.info import quarantined_in
@@ -23,13 +23,13 @@ CONFIDENCE_Z = 1.96
 Summary = Mapping[str, Any]
 
 
-def collection_section(summary: Summary, store: Store, ledger: Ledger) -> Section:
+def collection_section(summary: Summary, store: Store, run_log: RunLog) -> Section:
     """The statistics of a run's collection.
 
     Args:
         summary: what summary.json says.
         store: the interactions.
-        ledger: of the run.
+        run_log: of the run.
 
     Raises:
         StoreError: a manifest is damaged or foreign.
@@ -48,7 +48,7 @@ def collection_section(summary: Summary, store: Store, ledger: Ledger) -> Sectio
     tables = [_quarantine(quarantined)] if quarantined else []
     if objects["refused"]:
         tables.append(_refused(objects["refused"]))
-    drawings = (_rates(summary), _outcomes(summary), _seconds(summary, worker_seconds(ledger)))
+    drawings = (_rates(summary), _outcomes(summary), _seconds(summary, worker_seconds(run_log)))
     return Section("collection", "Collection", lead, tables=tuple(tables), drawings=drawings)
 
 
@@ -63,12 +63,12 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     return max(0.0, min(middle - half, share)), min(1.0, max(middle + half, share))
 
 
-def worker_seconds(ledger: Ledger) -> dict[str, float]:
+def worker_seconds(run_log: RunLog) -> dict[str, float]:
     """What workers spent their time on over all collection rounds, as far as rounds noted it."""
     spent: Counter[str] = Counter()
-    for name in ledger.finished:
+    for name in run_log.finished:
         if name.startswith("collect-"):
-            spent.update(ledger.result(name)["tally"]["seconds"])
+            spent.update(run_log.result(name)["tally"]["seconds"])
     spent.pop("total", None)
     return dict(spent)
 

@@ -71,7 +71,7 @@ class Posterior:
     affordance: Float32
 
 
-class Laboratory:
+class Counterfactuals:
     """Where the experiments take place: a run's task, camera, fidelity and policy.
 
     Args:

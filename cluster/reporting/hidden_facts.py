@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from cluster.reporting.clouds import CloudView, draw_panels, tried
-from cluster.reporting.counterfactuals import TRIES, Laboratory, Posterior, variations
+from cluster.reporting.counterfactuals import TRIES, Counterfactuals, Posterior, variations
 from cluster.reporting.page import Drawing, Section, plain, shortened
 from cluster.reporting.words import after
 from collector.objects.articulation import ArticulatedObject
@@ -11,7 +11,7 @@ from shared.policies.adaptation import Adapter
 
 
 def hidden_facts_section(
-    laboratory: Laboratory,
+    counterfactuals: Counterfactuals,
     target: ArticulatedObject | None,
     twins: Sequence[ArticulatedObject],
     say: Callable[[str], None],
@@ -20,13 +20,13 @@ def hidden_facts_section(
     key, title = "hidden-facts", "Affordance under hidden facts"
     if target is None:
         return Section(key, title, ("No test object of the run can be read any more, so nothing could be tried.",))
-    found = variations(laboratory.setting, target, twins)
+    found = variations(counterfactuals.setting, target, twins)
     drawings = []
     for number, variation in enumerate(found, start=1):
         say(f"trying hidden facts, {number} of {len(found)}: {variation.name}")
-        posteriors = laboratory.posteriors(variation)
+        posteriors = counterfactuals.posteriors(variation)
         if posteriors:
-            drawings.append(_drawing(variation.name, posteriors, laboratory.adapter))
+            drawings.append(_drawing(variation.name, posteriors, counterfactuals.adapter))
     if not drawings:
         return Section(key, title, (f"Nothing could be tried on {target.ref.id}.",))
     lead = (

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from cluster.evaluation.trials import first_episodes, most_telling
+from cluster.evaluation.trials import first_trials, most_telling
 from cluster.reporting.words import hidden, verdict
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
@@ -50,10 +50,10 @@ def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
         Whether there was any rollout to draw; if not, no file is written.
     """
     adapter = Adapter(policy)
-    episode = most_telling(first_episodes(evaluation), adapter)
-    if episode is None:
+    trial = most_telling(first_trials(evaluation), adapter)
+    if trial is None:
         return False
-    chosen, history = episode.rollout, episode.history
+    chosen, history = trial.rollout, trial.history
     first = history[0].observation
     panels = [Panel(first, adapter.affordance(first, []), "before any try")]
     for count, tried in enumerate(history, start=1):

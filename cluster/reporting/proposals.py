@@ -3,7 +3,7 @@
 import numpy as np
 import plotly.graph_objects as go
 
-from cluster.evaluation.trials import Episode
+from cluster.evaluation.trials import EvaluationTrial
 from cluster.reporting.clouds import CloudView, draw_panels, proposed, tried
 from cluster.reporting.page import Drawing, Section, plain, shortened
 from cluster.reporting.words import after, hidden, verdict
@@ -14,12 +14,12 @@ MOST_TRIES = 3
 """Two clouds a step; a browser draws no more than about sixteen at once."""
 
 
-def proposals_section(episode: Episode | None, adapter: Adapter) -> Section:
+def proposals_section(trial: EvaluationTrial | None, adapter: Adapter) -> Section:
     """The episode in which the tries of a run taught the most."""
     key, title = "proposals", "What AIP proposes, and what each try teaches"
-    if episode is None:
+    if trial is None:
         return Section(key, title, ("No test object was tried by AIP.",))
-    rollout, history = episode.rollout, episode.history[:MOST_TRIES]
+    rollout, history = trial.rollout, trial.history[:MOST_TRIES]
     lead = (
         f"{shortened(rollout.object.category)} {rollout.object.id}, not seen in training; hidden: "
         f"{hidden(rollout.dynamics)}. Of the evaluation, the object whose affordance the tries changed the most.",

@@ -13,7 +13,7 @@ from cluster.config.campaign_config import CampaignConfig
 from cluster.evaluation.tables import RESULTS_FILE
 from cluster.reporting.figures import collection_figures
 from cluster.runs.run_folder import RunFolder, read_json
-from cluster.runs.run_log import Ledger
+from cluster.runs.run_log import RunLog
 from shared.errors import UsageError
 from shared.formatting import terminal_table
 from shared.io.files import write_atomically
@@ -32,7 +32,7 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
         experiments: whether to try hidden facts in the simulator for the page.
         say: is told what is under way.
     """
-    ledger, store = Ledger(run.log), Store.open(run.store)
+    run_log, store = RunLog(run.log), Store.open(run.store)
     used = run.objects_used()
     versions = store.policy_versions()
     summary = {
@@ -40,10 +40,10 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
         "seed": config.seed,
         "rows": _rows(run),
         **collection_figures(store),
-        "interactions_per_core_second": _speed(ledger),
+        "interactions_per_core_second": _speed(run_log),
         "policy_versions": [0, *versions],
-        "stage_seconds": {name: round(seconds, 1) for name, seconds in ledger.seconds.items()},
-        "wall_seconds": round(sum(ledger.seconds.values()), 1),
+        "stage_seconds": {name: round(seconds, 1) for name, seconds in run_log.seconds.items()},
+        "wall_seconds": round(sum(run_log.seconds.values()), 1),
         "workers": config.workers,
         "objects": {
             # The name alone, since results are published; older runs have a whole path.
@@ -53,7 +53,7 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
         },
         "store_digest": store.digest(),
         "software": software_versions(),
-        "earlier_software": _earlier_software(run, ledger),
+        "earlier_software": _earlier_software(run, run_log),
     }
     write_atomically(run.summary, json.dumps(summary, indent=1, allow_nan=False).encode())
     _draw(run, versions[-1])
@@ -82,15 +82,15 @@ def _rows(run: RunFolder) -> list[dict[str, Any]]:
     return rows
 
 
-def _earlier_software(run: RunFolder, ledger: Ledger) -> list[dict[str, str]]:
+def _earlier_software(run: RunFolder, run_log: RunLog) -> list[dict[str, str]]:
     """Other versions that made parts of the run, in the order of their attempts."""
-    known = [run.begun_with(), *ledger.software]
+    known = [run.begun_with(), *run_log.software]
     return [each for n, each in enumerate(known) if each and each != software_versions() and each not in known[:n]]
 
 
-def _speed(ledger: Ledger) -> float | None:
+def _speed(run_log: RunLog) -> float | None:
     """Stored interactions for each second that a worker worked, over the collection rounds."""
-    tallies = [ledger.result(name)["tally"] for name in ledger.finished if name.startswith("collect-")]
+    tallies = [run_log.result(name)["tally"] for name in run_log.finished if name.startswith("collect-")]
     interactions = sum(tally["interactions"] for tally in tallies)
     seconds = sum(tally["seconds"].get("total", 0.0) for tally in tallies)
     return round(interactions / seconds, 2) if seconds > 0 else None

@@ -7,7 +7,7 @@ from typing import Any
 
 from cluster.config.campaign_config import CampaignConfig
 from cluster.evaluation.tables import RESULTS_FILE
-from cluster.evaluation.trials import first_episodes, most_telling
+from cluster.evaluation.trials import first_trials, most_telling
 from cluster.reporting.collecting import collection_section
 from cluster.reporting.failures import failures_section
 from cluster.reporting.page import Page, Picture, Section, render, shortened
@@ -15,7 +15,7 @@ from cluster.reporting.proposals import proposals_section
 from cluster.reporting.results import Results, further_section, read_results, results_section, tiles
 from cluster.reporting.training import training_section
 from cluster.runs.run_folder import RunFolder, read_json
-from cluster.runs.run_log import Ledger
+from cluster.runs.run_log import RunLog
 from shared.errors import UsageError
 from shared.io.files import read_bounded, write_atomically
 from shared.policies.adaptation import Adapter
@@ -42,7 +42,7 @@ def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say
     summary = read_json(run.summary)
     store, evaluation = Store.open(run.store), Store.open(run.evaluation)
     policy = Policy.from_files(store.read_policy(store.policy_versions()[-1]))
-    adapter, found = Adapter(policy), first_episodes(evaluation)
+    adapter, found = Adapter(policy), first_trials(evaluation)
     say("drawing tables, curves and clouds")
     novel = run.are_novel(run.objects_used().test)
     results = read_results(run.training("evaluate") / RESULTS_FILE, config.task, novel_categories=novel)
@@ -55,7 +55,7 @@ def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say
         _hidden_facts(run, evaluation, adapter, say) if experiments else _not_tried(run),
         failures_section(found, adapter),
         training_section(run.trainings, list(summary["stage_seconds"])),
-        collection_section(summary, store, Ledger(run.log)),
+        collection_section(summary, store, RunLog(run.log)),
     ]
     page = Page(
         title=f"AdaAfford: {config.task}",
@@ -78,7 +78,7 @@ def _further(run: RunFolder) -> list[tuple[str, Results]]:
 
 def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Callable[[str], None]) -> Section:
     # Only here, since they need the simulator.
-    from cluster.reporting.counterfactuals import Laboratory, first_readable, hinge_twins
+    from cluster.reporting.counterfactuals import Counterfactuals, first_readable, hinge_twins
     from cluster.reporting.hidden_facts import hidden_facts_section
 
     used, setting = run.objects_used(), evaluation.setting
@@ -89,7 +89,7 @@ def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Call
         say(str(error))
         return _not_tried(run)
     with TemporaryDirectory(prefix="adaafford-report-") as folder:
-        return hidden_facts_section(Laboratory(setting, adapter), target, hinge_twins(setting, Path(folder)), say)
+        return hidden_facts_section(Counterfactuals(setting, adapter), target, hinge_twins(setting, Path(folder)), say)
 
 
 def _not_tried(run: RunFolder) -> Section:

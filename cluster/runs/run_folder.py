@@ -8,7 +8,7 @@ RUN/
   store/                 the interactions, and the published policies
   evaluation/            a second store: what was tried on unseen objects
   training/<stage>/      checkpoints, metrics and output of each training stage
-  log.jsonl              the ledger: stages, times, results
+  log.jsonl              the run log: stages, times, results
   summary.json           figures
   affordance.png         one object before and after each try
   report.html            all of it to look at, in one file
@@ -93,7 +93,7 @@ class RunFolder:
 
     @property
     def log(self) -> Path:
-        """The ledger."""
+        """The run log."""
         return self.path / "log.jsonl"
 
     @property

@@ -1,4 +1,4 @@
-"""The ledger of a run: which stages are done, and how long each took over all attempts.
+"""The run log of a run: which stages are done, and how long each took over all attempts.
 
 `log.jsonl` is append-only, one JSON object a line. A kill can at worst tear its last line, which is then ignored and
 fenced off; so the file is both the log for people and the record that a resumption relies on.
@@ -35,7 +35,7 @@ _BEAT = re.compile(
 Clock = Callable[[], float]
 
 
-class Ledger:
+class RunLog:
     """Stages done and seconds spent, kept in RUN/log.jsonl."""
 
     def __init__(self, path: Path, clock: Clock = time.monotonic) -> None:

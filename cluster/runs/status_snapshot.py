@@ -13,7 +13,7 @@ from typing import Any
 
 from cluster.collection.status_writer import DriverStatus, read_status
 from cluster.runs.run_folder import RunFolder
-from cluster.runs.run_log import Ledger
+from cluster.runs.run_log import RunLog
 from learner.settings import METRICS_FILE, PUBLISHED_FILE
 from shared.errors import UsageError
 from shared.plan import Job, covered
@@ -46,7 +46,7 @@ class WorkerNow:
 
 
 @dataclass(frozen=True, slots=True)
-class StoreStanding:
+class StoreSnapshot:
     """How a store stands.
 
     Attributes:
@@ -67,7 +67,7 @@ class StoreStanding:
 
 
 @dataclass(frozen=True, slots=True)
-class TrainingStanding:
+class TrainingSnapshot:
     """The last line of metrics that a training wrote.
 
     Attributes:
@@ -84,7 +84,7 @@ class TrainingStanding:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class StatusSnapshot:
     """How something stands.
 
     Attributes:
@@ -102,11 +102,11 @@ class Standing:
     stages_done: tuple[str, ...] = ()
     stage: str | None = None
     stage_s: float = 0.0
-    stores: tuple[StoreStanding, ...] = ()
-    training: TrainingStanding | None = None
+    stores: tuple[StoreSnapshot, ...] = ()
+    training: TrainingSnapshot | None = None
 
 
-def standing_of(where: str, now: float | None = None) -> Standing:
+def snapshot_of(where: str, now: float | None = None) -> StatusSnapshot:
     """How a run, a store or a learner stands.
 
     Args:
@@ -120,42 +120,43 @@ def standing_of(where: str, now: float | None = None) -> Standing:
     now = time.time() if now is None else now
     folder = Path(where)
     if is_url(where) or (folder / STORE_FILE).is_file():
-        return Standing("store", where, stores=(_store(where, now),))
+        return StatusSnapshot("store", where, stores=(_store(where, now),))
     run = RunFolder(folder)
     if run.config.is_file() and run.log.is_file():
         return _run(run, now)
     if (folder / PUBLISHED_FILE).is_file() or (folder / "prior").is_dir():
-        return Standing("learner", where, training=_training(folder.glob(f"*/{METRICS_FILE}")))
+        return StatusSnapshot("learner", where, training=_training(folder.glob(f"*/{METRICS_FILE}")))
     raise UsageError(f"{where}: no run, store or learner's folder; name one, or the s3:// URL of a store")
 
 
-def _run(run: RunFolder, now: float) -> Standing:
-    ledger = Ledger(run.log)
-    open_stages = [name for name in ledger.seconds if name not in ledger.finished]
+def _run(run: RunFolder, now: float) -> StatusSnapshot:
+    run_log = RunLog(run.log)
+    open_stages = [name for name in run_log.seconds if name not in run_log.finished]
     stores = [path for path in (run.store, run.evaluation) if (path / STORE_FILE).is_file()]
-    return Standing(
+    return StatusSnapshot(
         what="run",
         where=str(run.path),
-        stages_done=ledger.finished,
+        stages_done=run_log.finished,
         stage=open_stages[-1] if open_stages else None,
-        stage_s=ledger.seconds[open_stages[-1]] if open_stages else 0.0,
+        stage_s=run_log.seconds[open_stages[-1]] if open_stages else 0.0,
         stores=tuple(_store(str(path), now) for path in stores),
         training=_training(run.path.glob(f"training/*/{METRICS_FILE}")),
     )
 
 
-def _store(where: str, now: float) -> StoreStanding:
+def _store(where: str, now: float) -> StoreSnapshot:
     store = Store.open(where)
-    driver = read_status(store.place)
-    crumbs = store.underway.crumbs()
-    return StoreStanding(
+    driver = read_status(store.backend)
+    heartbeats = store.crash_log.heartbeats()
+    return StoreSnapshot(
         where=where,
         rollouts=_rollouts(store),
         policies=store.policy_versions(),
         driver=driver,
         driver_alive=driver is not None and driver.is_alive(now),
         workers=tuple(
-            WorkerNow(name, host_of(store.place, name), crumb.shard_id, crumb.rollout) for name, crumb in crumbs.items()
+            WorkerNow(name, host_of(store.backend, name), heartbeat.shard_id, heartbeat.rollout)
+            for name, heartbeat in heartbeats.items()
         ),
     )
 
@@ -169,10 +170,10 @@ def _rollouts(store: Store) -> dict[str, int]:
 
 
 def _jobs(store: Store) -> Iterable[Job]:
-    return filter(None, map(parse_shard_id, store.place.names(SHARDS_FOLDER)))
+    return filter(None, map(parse_shard_id, store.backend.names(SHARDS_FOLDER)))
 
 
-def _training(files: Iterable[Path]) -> TrainingStanding | None:
+def _training(files: Iterable[Path]) -> TrainingSnapshot | None:
     """Of the stage that was validated last."""
     written = {file: file.stat().st_mtime for file in files if file.is_file()}
     for file in sorted(written, key=lambda file: written[file], reverse=True):
@@ -183,7 +184,7 @@ def _training(files: Iterable[Path]) -> TrainingStanding | None:
                 for name, value in line.items()
                 if isinstance(value, int | float) and abs(value) < LARGEST_NUMBER
             }
-            return TrainingStanding(file.parent.name, int(numbers.pop("step", 0)), written[file], numbers)
+            return TrainingSnapshot(file.parent.name, int(numbers.pop("step", 0)), written[file], numbers)
     return None
 
 

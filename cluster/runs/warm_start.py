@@ -19,7 +19,7 @@ _DEPTH_IN_RUN = 3
 """How far below its run a policy lies at most: RUN/store/policies/VERSION."""
 
 
-def adopt(source: str, task: str, out: Path) -> None:
+def warm_start(source: str, task: str, out: Path) -> None:
     """Copy a policy for `task` into the folder of a stage.
 
     Raises:
@@ -37,7 +37,7 @@ def adopt(source: str, task: str, out: Path) -> None:
 
 
 def fit_to_start_from(source: str, task: str) -> Policy:
-    """The policy at `source`; raises as `adopt` does."""
+    """The policy at `source`; raises as `warm_start` does."""
     policy = load_policy(source)
     if policy.task != task:
         raise UsageError(f"start_from '{source}': a policy for '{policy.task}', but the run is of '{task}'")

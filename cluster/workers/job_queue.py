@@ -28,7 +28,7 @@ class PlannedJob:
     job: Job
 
 
-class Orders(Protocol):
+class JobQueue(Protocol):
     """Jobs that are made up as they are asked for."""
 
     @property
@@ -46,7 +46,7 @@ class Orders(Protocol):
         ...
 
 
-class Series:
+class RolloutQueue:
     """The rollouts of one proposer that are left to do.
 
     Args:
@@ -76,11 +76,11 @@ class Series:
 
     @property
     def ended(self) -> bool:
-        """See `Orders.ended`."""
+        """See `JobQueue.ended`."""
         return not self._missing
 
     def take(self) -> PlannedJob | None:
-        """See `Orders.take`."""
+        """See `JobQueue.take`."""
         if self.ended:
             return None
         plan = self._plan_now()

@@ -1,4 +1,4 @@
-"""What Prometheus sees of a fleet, through Ray's own exporter (its full installation, `ray[default]`, has one).
+"""What Prometheus sees of a worker group, through Ray's own exporter (its full installation, `ray[default]`, has one).
 
 Labels are few and fixed: task, proposer, outcome, stage, cause. None is ever an object, a rollout, a shard or a worker,
 of which there are millions.
@@ -18,7 +18,7 @@ from ray.util.metrics import Counter, Gauge
 from shared.plan import Plan
 
 if TYPE_CHECKING:
-    from collector.job_result import Receipt
+    from collector.job_result import JobResult
 
 Cause = Literal["fault", "loss", "growth"]
 """Why a worker was replaced: of a rollout's making, killed from outside, or grown too large."""
@@ -39,18 +39,18 @@ class FleetMetrics:
         self._workers = Gauge("adaafford_workers", "Workers that the driver keeps busy.")
         self._workers.set(workers)
 
-    def add(self, plan: Plan, receipt: "Receipt") -> None:
+    def add(self, plan: Plan, job_result: "JobResult") -> None:
         """Count a shard."""
         tags = {"task": plan.setting.task, "proposer": plan.proposer}
         for counter, amount in (
-            (self._rollouts, receipt.rollouts),
-            (self._quarantined, receipt.quarantined),
-            (self._successes, receipt.successes),
+            (self._rollouts, job_result.rollouts),
+            (self._quarantined, job_result.quarantined),
+            (self._successes, job_result.successes),
         ):
             _increase(counter, amount, tags)
-        for outcome, count in receipt.outcomes.items():
+        for outcome, count in job_result.outcomes.items():
             _increase(self._interactions, count, {**tags, "outcome": outcome})
-        for stage, seconds in receipt.seconds.items():
+        for stage, seconds in job_result.seconds.items():
             _increase(self._seconds, seconds, {**tags, "stage": stage})
         self._policy.set(plan.policy_version, tags)
 

@@ -10,7 +10,7 @@ LOOK_S = 2.0
 """How often a store is asked for newer policies: part of how old a policy may be that still proposes."""
 
 
-class PlanInForce:
+class PolicySource:
     """The plan of one proposer at each moment; call it.
 
     A policy proposes what is handed out until `LOOK_S` after its successor was published. What was handed out before
@@ -20,7 +20,7 @@ class PlanInForce:
         store: where policies are published.
         proposer: who proposes.
         version: the policy; None: always the newest.
-        adopt: is called with each plan before it is in force.
+        warm_start: is called with each plan before it is in force.
         clock: monotonic seconds.
     """
 
@@ -29,13 +29,13 @@ class PlanInForce:
         store: Store,
         proposer: str,
         version: int | None,
-        adopt: Callable[[Plan], None],
+        warm_start: Callable[[Plan], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._store = store
         self._proposer = proposer
         self._version = version
-        self._adopt = adopt
+        self._adopt = warm_start
         self._clock = clock
         self._looked = -LOOK_S
         self.plan: Plan | None = None

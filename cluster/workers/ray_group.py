@@ -1,7 +1,7 @@
-"""The fleet of Ray actors: bounded work in flight, dead and hung actors replaced, only receipts coming back.
+"""The worker group of Ray actors: bounded work in flight, dead and hung actors replaced, only job results coming back.
 
 What the driver does for a shard does not depend on how many actors there are: answers call back by themselves, instead
-of being looked for among all that are expected, and seats are filed by what they want (`cluster.workers.slots`).
+of being looked for among all that are expected, and slots are filed by what they want (`cluster.workers.slots`).
 """
 
 import logging
@@ -17,18 +17,18 @@ from typing import Any, Protocol
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from cluster.workers.job_queue import Orders, PlannedJob
+from cluster.workers.job_queue import JobQueue, PlannedJob
 from cluster.workers.metrics import Cause, FleetMetrics
-from cluster.workers.retries import Backlog, Blame, Failure, of_environment
-from cluster.workers.slots import Seat, Seats, Task
+from cluster.workers.retries import Backlog, Failure, RetryPolicy, of_environment
+from cluster.workers.slots import Slot, Slots, Task
 from cluster.workers.worker_group import WAIT_S
 from collector.actor import WorkerActor
-from collector.job_result import Receipt, WorkerFactory
+from collector.job_result import JobResult, WorkerFactory
 from collector.watchdog import Limits
 from shared.errors import AdaAffordError, WorkerError
 from shared.io.files import end_if_here
 from shared.plan import Job, Plan
-from shared.store.crash_log import Underway
+from shared.store.crash_log import CrashLog
 
 START_LIMIT_S = 120.0
 """An actor's process imports an engine and PyTorch, which a busy machine or a cold disk may slow; no job's fault."""
@@ -38,23 +38,23 @@ LOST = "its process was lost without a word: killed from outside, or for want of
 KEPT = 3
 """Plans and policies that the object store holds; older ones were replaced, and only jobs that failed want them."""
 POLL_S = 1.0
-"""How often the driver looks for hung actors, however many receipts come."""
+"""How often the driver looks for hung actors, however many job results come."""
 NODE_S = 2.0
 """How often it looks, while actors are awaited, whether its own node lives: without it none may ever come."""
 LOOK_S = 0.1
-"""How long it looks each time, at one after the other: a breadcrumb in a bucket takes a request."""
+"""How long it looks each time, at one after the other: a heartbeat in a bucket takes a request."""
 
 logger = logging.getLogger(__name__)
 
 
 class Actor(Protocol):
-    """What a fleet asks of an actor; each answer comes later."""
+    """What a worker group asks of an actor; each answer comes later."""
 
     def arrive(self) -> "Future[str]":
         """The name of its process, once that is up."""
         ...
 
-    def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[Receipt]":
+    def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[JobResult]":
         """See `collector.actor.WorkerActor.run`; executed in the order asked."""
         ...
 
@@ -66,18 +66,18 @@ class Actor(Protocol):
 class ProcessActor:
     """An `Actor`: a process of its own, with one CPU. No restarts by Ray, which would run only `__init__` again."""
 
-    def __init__(self, make_worker: WorkerFactory, underway: Underway, limits: Limits) -> None:
+    def __init__(self, make_worker: WorkerFactory, crash_log: CrashLog, limits: Limits) -> None:
         actor: Any = ray.remote(num_cpus=1, max_restarts=0)(WorkerActor)
-        self._actor = actor.remote(make_worker, underway, limits)
+        self._actor = actor.remote(make_worker, crash_log, limits)
 
     def arrive(self) -> "Future[str]":
         """See `Actor.arrive`."""
         answer: Future[str] = self._actor.arrive.remote().future()
         return answer
 
-    def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[Receipt]":
+    def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[JobResult]":
         """See `Actor.run`."""
-        answer: Future[Receipt] = self._actor.run.remote([plan], job, policy, quarantined).future()
+        answer: Future[JobResult] = self._actor.run.remote([plan], job, policy, quarantined).future()
         return answer
 
     def end(self) -> None:
@@ -106,13 +106,13 @@ class _Shelf:
         return [self._kept[key][1]] if key in self._kept else []
 
 
-class RayFleet:
+class RayWorkerGroup:
     """Actors of `collector.actor`, one CPU each, alive over all rounds. Needs a session (`cluster.workers.session`)."""
 
     def __init__(
         self,
         make_worker: WorkerFactory,
-        underway: Underway,
+        crash_log: CrashLog,
         workers: int,
         limits: Limits,
         call: Callable[[], Actor] | None = None,
@@ -121,227 +121,233 @@ class RayFleet:
 
         Args:
             make_worker: makes the worker within an actor.
-            underway: where actors leave their breadcrumbs.
+            crash_log: where actors leave their heartbeats.
             workers: how many actors.
             limits: what a rollout may take; an actor that goes beyond is ended.
             call: makes an actor; None: a process with a worker.
         """
         self.workers = workers
         self.restarts = 0
-        self._call = call or partial(ProcessActor, make_worker, underway, limits)
-        self._underway = underway
+        self._call = call or partial(ProcessActor, make_worker, crash_log, limits)
+        self._crash_log = crash_log
         self._limits = limits
         self._poll_s = min(POLL_S, limits.rollout_s / 4)
         self._looked = self._looked_at_node = time.monotonic()
-        self._seats = Seats(workers)
+        self._slots = Slots(workers)
         self._in_flight = 0
-        self._answered: SimpleQueue[Seat] = SimpleQueue()
+        self._answered: SimpleQueue[Slot] = SimpleQueue()
         self._plans, self._policies = _Shelf(), _Shelf()
         self._metrics = FleetMetrics(workers)
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
-        """See `Fleet.load_policy`: one `ray.put`; actors pull it when a plan first needs it."""
+        """See `WorkerGroup.load_policy`: one `ray.put`; actors pull it when a plan first needs it."""
         self._policies.put(version, dict(files))
 
-    def run(self, orders: Orders, on_receipt: Callable[[Receipt], None]) -> None:
-        """See `Fleet.run`."""
-        blame = Blame(self.workers)
-        backlog = Backlog(orders, blame)
+    def run(self, orders: JobQueue, on_result: Callable[[JobResult], None]) -> None:
+        """See `WorkerGroup.run`."""
+        retries = RetryPolicy(self.workers)
+        backlog = Backlog(orders, retries)
         try:
             while not backlog.ended or self._in_flight:
-                self._hand_out(backlog, blame)
-                for seat in self._wait():
+                self._hand_out(backlog, retries)
+                for slot in self._wait():
                     # An actor's answers are taken in the order of what was asked, in whichever they are announced; of
                     # one that was dismissed some are announced that nobody waits for.
-                    while seat.tasks and seat.tasks[0].answer.done():
-                        self._take_in(seat, backlog, blame, on_receipt)
-                self._replace_hung(backlog, blame)
+                    while slot.tasks and slot.tasks[0].answer.done():
+                        self._take_in(slot, backlog, retries, on_result)
+                self._replace_hung(backlog, retries)
         finally:
             # Only after a failure or an interrupt is anything left; what an actor would still commit is wanted by the
             # next run anyway, but nobody would wait for it, so the actor goes.
-            for seat in self._seats:
-                if seat.orders:
-                    self._dismiss(seat)
+            for slot in self._slots:
+                if slot.orders:
+                    self._dismiss(slot)
 
     def close(self) -> None:
-        """See `Fleet.close`."""
-        for seat in self._seats:
-            self._dismiss(seat)
+        """See `WorkerGroup.close`."""
+        for slot in self._slots:
+            self._dismiss(slot)
 
-    def _wait(self) -> Iterator[Seat]:
-        """Seats whose actors have answered, as soon as there is one; those that answer meanwhile come the next time."""
-        timeout_s = self._poll_s if self._in_flight or self._seats.called else WAIT_S
+    def _wait(self) -> Iterator[Slot]:
+        """Slots whose actors have answered, as soon as there is one; those that answer meanwhile come the next time."""
+        timeout_s = self._poll_s if self._in_flight or self._slots.called else WAIT_S
         for _ in range(max(1, self._answered.qsize())):
             try:
                 yield self._answered.get(timeout=timeout_s)
             except Empty:
                 return
 
-    def _hand_out(self, backlog: Backlog, blame: Blame) -> None:
+    def _hand_out(self, backlog: Backlog, retries: RetryPolicy) -> None:
         """Give actors that are up what they want, and call an actor for each order that has to wait.
 
         An actor that is called may be long in coming, or for ever where a machine has left; so nothing is bound to it.
 
         Args:
             backlog: where they come from, and those that actors were called for go.
-            blame: knows what is not to be executed any more.
+            retries: knows what is not to be executed any more.
         """
-        while (seat := self._seats.hungriest) is not None:
+        while (slot := self._slots.most_idle) is not None:
             order = backlog.take(idle=not self._in_flight)
             if order is None:
                 return
-            self._give(seat, order, blame)
-        while (seat := self._seats.empty) is not None:
-            if len(backlog) <= self._seats.called:
+            self._give(slot, order, retries)
+        while (slot := self._slots.empty) is not None:
+            if len(backlog) <= self._slots.called:
                 order = backlog.take_new(idle=not self._in_flight and not backlog)
                 if order is None:
                     return
                 backlog.append(order)
-            seat.actor, seat.busy_since = self._call(), time.monotonic()
-            self._ask(seat, None, seat.actor.arrive())
+            slot.actor, slot.busy_since = self._call(), time.monotonic()
+            self._ask(slot, None, slot.actor.arrive())
 
-    def _give(self, seat: Seat, order: PlannedJob, blame: Blame) -> None:
-        """Submit an order to the seat's actor."""
-        if not seat.tasks:
-            seat.busy_since = time.monotonic()
+    def _give(self, slot: Slot, order: PlannedJob, retries: RetryPolicy) -> None:
+        """Submit an order to the slot's actor."""
+        if not slot.tasks:
+            slot.busy_since = time.monotonic()
         plan = self._plans.put(order.plan.key, order.plan)
         # Of a version that is no longer kept, the worker reads the weights in the store.
         policy = self._policies.get(order.plan.policy_version)
         self._in_flight += 1
-        self._ask(seat, order, seat.actor.run(plan, order.job, policy, blame.quarantined(order.job)))
+        self._ask(slot, order, slot.actor.run(plan, order.job, policy, retries.quarantined(order.job)))
 
-    def _ask(self, seat: Seat, order: PlannedJob | None, answer: "Future[Any]") -> None:
+    def _ask(self, slot: Slot, order: PlannedJob | None, answer: "Future[Any]") -> None:
         """Take note of what an actor was asked."""
-        seat.tasks.append(Task(order, answer))
-        self._seats.file(seat)
-        answer.add_done_callback(lambda _: self._answered.put(seat))
+        slot.tasks.append(Task(order, answer))
+        self._slots.file(slot)
+        answer.add_done_callback(lambda _: self._answered.put(slot))
 
-    def _take_in(self, seat: Seat, backlog: Backlog, blame: Blame, on_receipt: Callable[[Receipt], None]) -> None:
-        """Report the receipt that has come for the seat's oldest task, or see to the failure."""
-        task = seat.tasks[0]
+    def _take_in(
+        self, slot: Slot, backlog: Backlog, retries: RetryPolicy, on_result: Callable[[JobResult], None]
+    ) -> None:
+        """Report the job result that has come for the slot's oldest task, or see to the failure."""
+        task = slot.tasks[0]
         try:
             message = task.answer.result()
         except RayTaskError as error:
             if isinstance(error.cause, AdaAffordError):
                 raise error.cause from None
             cause = error.cause or error
-            self._fail(seat, backlog, blame, Failure.of_exception(cause, None), in_rollout=not of_environment(cause))
+            self._fail(slot, backlog, retries, Failure.of_exception(cause, None), in_rollout=not of_environment(cause))
             return
         except RayError:
-            words = self._underway.fault_of(seat.process) if seat.process else ""
-            self._fail(seat, backlog, blame, Failure(words or LOST, None, fault=bool(words)))
+            words = self._crash_log.fault_of(slot.process) if slot.process else ""
+            self._fail(slot, backlog, retries, Failure(words or LOST, None, fault=bool(words)))
             return
-        seat.settle()
+        slot.settle()
         if task.order is None:
-            seat.process = message
-            logger.info("a worker is up", extra={"worker": seat.process})
+            slot.process = message
+            logger.info("a worker is up", extra={"worker": slot.process})
         else:
             self._in_flight -= 1
-            blame.acquit(task.order.job)
-            self._note_done(seat, task.order.plan, message)
-            self._retire_if_grown(seat, message)
-        if seat.retiring and not seat.tasks:
-            self._dismiss(seat)
+            retries.reset(task.order.job)
+            self._note_done(slot, task.order.plan, message)
+            self._retire_if_grown(slot, message)
+        if slot.retiring and not slot.tasks:
+            self._dismiss(slot)
             self._count_replaced("growth")
-        self._seats.file(seat)
+        self._slots.file(slot)
         if task.order is not None:
-            on_receipt(message)
+            on_result(message)
 
-    def _replace_hung(self, backlog: Backlog, blame: Blame) -> None:
+    def _replace_hung(self, backlog: Backlog, retries: RetryPolicy) -> None:
         """Replace actors that hang so thoroughly that not even their own watchdog ended them.
 
-        A rollout is over its limit when the driver has seen its breadcrumb unchanged for so long by its own clock:
+        A rollout is over its limit when the driver has seen its heartbeat unchanged for so long by its own clock:
         clocks of machines differ.
         """
         now = time.monotonic()
         if now - self._looked < self._poll_s:
             return
         self._looked = now
-        if self._seats.called and now - self._looked_at_node > NODE_S:
+        if self._slots.called and now - self._looked_at_node > NODE_S:
             self._looked_at_node = now
             _require_own_node()
-        for seat in self._seats.in_turn():
+        for slot in self._slots.in_turn():
             if time.monotonic() - now > LOOK_S:
                 return
-            busy_s = now - seat.busy_since if seat.tasks else 0.0
-            if seat.process:
+            busy_s = now - slot.busy_since if slot.tasks else 0.0
+            if slot.process:
                 if busy_s > self._limits.rollout_s:
-                    self._look(seat, backlog, blame)
+                    self._look(slot, backlog, retries)
             elif busy_s > START_LIMIT_S:
-                self._call_again(seat, blame)
+                self._call_again(slot, retries)
 
-    def _look(self, seat: Seat, backlog: Backlog, blame: Blame) -> None:
-        """Replace a seat's actor if it hangs."""
-        crumb, since = seat.look(self._underway)
-        limit = START_LIMIT_S if crumb is None else self._limits.rollout_s + GRACE_S
+    def _look(self, slot: Slot, backlog: Backlog, retries: RetryPolicy) -> None:
+        """Replace a slot's actor if it hangs."""
+        heartbeat, since = slot.look(self._crash_log)
+        limit = START_LIMIT_S if heartbeat is None else self._limits.rollout_s + GRACE_S
         if time.monotonic() - since > limit:
             # A process that is stopped does not hear Ray.
-            end_if_here(seat.process)
+            end_if_here(slot.process)
             reason = f"took more than {limit:g} s, and had to be killed"
-            self._fail(seat, backlog, blame, Failure(reason, None, fault=True))
+            self._fail(slot, backlog, retries, Failure(reason, None, fault=True))
 
-    def _call_again(self, seat: Seat, blame: Blame) -> None:
+    def _call_again(self, slot: Slot, retries: RetryPolicy) -> None:
         """Give up an actor that has not come; that others work means that a machine is missing, which may come back."""
-        self._dismiss(seat)
-        if not any(other.process for other in self._seats):
-            blame.charge_nobody(f"the start of its process took more than {START_LIMIT_S:g} s")
+        self._dismiss(slot)
+        if not any(other.process for other in self._slots):
+            retries.record_harmless(f"the start of its process took more than {START_LIMIT_S:g} s")
 
-    def _note_done(self, seat: Seat, plan: Plan, receipt: Receipt) -> None:
+    def _note_done(self, slot: Slot, plan: Plan, job_result: JobResult) -> None:
         """Tell log and metrics of a shard."""
-        self._metrics.add(plan, receipt)
-        about = {"plan": plan.key, "policy": plan.policy_version, "shard": receipt.shard_id, "worker": seat.process}
-        about |= {"interactions": receipt.interactions, "successes": receipt.successes}
-        about |= {"seconds": receipt.seconds.get("total", 0.0)}
-        logger.info("shard %s is committed", receipt.shard_id, extra=about)
+        self._metrics.add(plan, job_result)
+        about = {"plan": plan.key, "policy": plan.policy_version, "shard": job_result.shard_id, "worker": slot.process}
+        about |= {"interactions": job_result.interactions, "successes": job_result.successes}
+        about |= {"seconds": job_result.seconds.get("total", 0.0)}
+        logger.info("shard %s is committed", job_result.shard_id, extra=about)
 
-    def _retire_if_grown(self, seat: Seat, receipt: Receipt) -> None:
+    def _retire_if_grown(self, slot: Slot, job_result: JobResult) -> None:
         """Hand an actor no further jobs if its memory has grown by half of what it may grow by."""
-        if seat.first_mb is None:
-            seat.first_mb = receipt.memory_mb
-        grown_mb = receipt.memory_mb - seat.first_mb
-        if not seat.retiring and grown_mb > self._limits.memory_mb / 2:
-            about = {"worker": seat.process, "shard": receipt.shard_id}
+        if slot.first_mb is None:
+            slot.first_mb = job_result.memory_mb
+        grown_mb = job_result.memory_mb - slot.first_mb
+        if not slot.retiring and grown_mb > self._limits.memory_mb / 2:
+            about = {"worker": slot.process, "shard": job_result.shard_id}
             logger.warning("a worker has grown by %.0f MB and is replaced", grown_mb, extra=about)
-            seat.retiring = True
+            slot.retiring = True
 
-    def _fail(self, seat: Seat, backlog: Backlog, blame: Blame, failure: Failure, *, in_rollout: bool = True) -> None:
-        """Replace the seat's actor and put its jobs back in front; only what was under way is to blame.
+    def _fail(
+        self, slot: Slot, backlog: Backlog, retries: RetryPolicy, failure: Failure, *, in_rollout: bool = True
+    ) -> None:
+        """Replace the slot's actor and put its jobs back in front; only what was under way is to blame.
 
         Args:
-            seat: whose actor failed.
+            slot: whose actor failed.
             backlog: takes the jobs back.
-            blame: decides what comes of them.
+            retries: decides what comes of them.
             failure: how; which rollout was under way is found here.
             in_rollout: whether that may be to blame.
         """
-        orders = seat.orders
-        crumb = self._underway.crumb_of(seat.process) if seat.process else None
-        about = {"worker": seat.process, "rollout": crumb.rollout if crumb else None, "reason": failure.reason}
+        orders = slot.orders
+        heartbeat = self._crash_log.heartbeat_of(slot.process) if slot.process else None
+        about = {"worker": slot.process, "rollout": heartbeat.rollout if heartbeat else None, "reason": failure.reason}
         logger.info("a worker is replaced: %s", failure.reason, extra=about)
-        self._dismiss(seat)
+        self._dismiss(slot)
         self._count_replaced("fault" if failure.fault else "loss")
         if not orders:
-            blame.charge_nobody(failure.reason)
+            retries.record_harmless(failure.reason)
             return
         jobs = [order.job for order in orders]
-        job = next((job for job in jobs if crumb is not None and crumb.shard_id == job.shard_id), jobs[0])
-        known = crumb is not None and crumb.shard_id == job.shard_id and in_rollout
-        blame.charge(job, replace(failure, rollout=crumb.rollout if known and crumb is not None else None))
+        job = next((job for job in jobs if heartbeat is not None and heartbeat.shard_id == job.shard_id), jobs[0])
+        known = heartbeat is not None and heartbeat.shard_id == job.shard_id and in_rollout
+        retries.record_failure(
+            job, replace(failure, rollout=heartbeat.rollout if known and heartbeat is not None else None)
+        )
         backlog.put_back(orders)
 
     def _count_replaced(self, cause: Cause) -> None:
         self.restarts += 1
         self._metrics.replaced(cause)
 
-    def _dismiss(self, seat: Seat) -> None:
-        """End the seat's actor and forget what it was given and what it left."""
-        if seat.actor is not None:
-            seat.actor.end()
-        if seat.process:
-            self._underway.forget(seat.process)
-        self._in_flight -= len(seat.orders)
-        seat.vacate()
-        self._seats.file(seat)
+    def _dismiss(self, slot: Slot) -> None:
+        """End the slot's actor and forget what it was given and what it left."""
+        if slot.actor is not None:
+            slot.actor.end()
+        if slot.process:
+            self._crash_log.forget(slot.process)
+        self._in_flight -= len(slot.orders)
+        slot.clear()
+        self._slots.file(slot)
 
 
 def _require_own_node() -> None:

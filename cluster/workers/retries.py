@@ -16,7 +16,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cluster.workers.job_queue import Orders, PlannedJob
+from cluster.workers.job_queue import JobQueue, PlannedJob
 from shared.errors import WorkerError
 from shared.io.redaction import without_secrets
 from shared.io.text import plain
@@ -70,7 +70,7 @@ class Failure:
         return cls(describe(error), None if of_environment(error) else rollout, fault=True)
 
 
-class Blame:
+class RetryPolicy:
     """Counts the failures of jobs.
 
     Args:
@@ -97,7 +97,7 @@ class Blame:
         keys = ((job.plan_key, rollout) for rollout in range(job.start, job.stop))
         return {key[1]: self._quarantined[key] for key in keys if key in self._quarantined}
 
-    def acquit(self, job: Job) -> None:
+    def reset(self, job: Job) -> None:
         """Take note that a job was done, so workers can live and rollouts can succeed."""
         self._idle_losses = 0
         self._note_success(job.stop - job.start - len(self.quarantined(job)))
@@ -111,7 +111,7 @@ class Blame:
         """Whether a rollout of the job is to be quarantined, and none has succeeded since to make that believable."""
         return any((job.plan_key, rollout) in self._since_success for rollout in self.quarantined(job))
 
-    def charge_nobody(self, reason: str) -> None:
+    def record_harmless(self, reason: str) -> None:
         """Count a process that was lost before it was given a job.
 
         Raises:
@@ -122,7 +122,7 @@ class Blame:
         if self._idle_losses >= self._most_idle_losses:
             raise WorkerError(f"{self._idle_losses} workers were lost before they had a job; last: {reason}")
 
-    def charge(self, job: Job, failure: Failure) -> None:
+    def record_failure(self, job: Job, failure: Failure) -> None:
         """Count a failure of `job`, which is tried again: without the culprit if that failed often enough.
 
         Raises:
@@ -199,12 +199,12 @@ class Backlog:
 
     Args:
         orders: the new ones.
-        blame: knows which rollouts are to be quarantined.
+        retries: knows which rollouts are to be quarantined.
     """
 
-    def __init__(self, orders: Orders, blame: Blame) -> None:
+    def __init__(self, orders: JobQueue, retries: RetryPolicy) -> None:
         self._orders = orders
-        self._blame = blame
+        self._retries = retries
         self._again: deque[PlannedJob] = deque()
         self._suspended: deque[PlannedJob] = deque()
 
@@ -224,7 +224,7 @@ class Backlog:
     def put_back(self, orders: Sequence[PlannedJob]) -> None:
         """Take back orders that failed, in front of the others."""
         for order in reversed(orders):
-            (self._suspended if self._blame.is_suspended(order.job) else self._again).appendleft(order)
+            (self._suspended if self._retries.is_suspended(order.job) else self._again).appendleft(order)
 
     def take(self, *, idle: bool) -> PlannedJob | None:
         """The next one; None where there is none, or none yet.
@@ -239,11 +239,11 @@ class Backlog:
 
     def take_new(self, *, idle: bool) -> PlannedJob | None:
         """The next one behind those that are to be handed out at once; see `take`."""
-        if self._suspended and not self._blame.is_suspended(self._suspended[0].job):
+        if self._suspended and not self._retries.is_suspended(self._suspended[0].job):
             return self._suspended.popleft()
         order = self._orders.take()
         if order is None and self._suspended and idle:
-            self._blame.require_any_success(self._suspended[0].job, ever=self._orders.any_done)
+            self._retries.require_any_success(self._suspended[0].job, ever=self._orders.any_done)
             return self._suspended.popleft()
         return order
 

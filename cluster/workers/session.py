@@ -19,7 +19,7 @@ from typing import Any
 
 import psutil
 
-from cluster.workers.worker_group import Fleet, SerialFleet, make_worker
+from cluster.workers.worker_group import SerialWorkerGroup, WorkerGroup, make_worker
 from collector.job_result import WorkerFactory
 from collector.watchdog import Limits
 from shared.errors import StoreError, UsageError, WorkerError
@@ -27,10 +27,10 @@ from shared.extras import require_packages
 from shared.io.files import is_gone, process_name, read_bounded, remove_if_abandoned, remove_tree, temporary_name
 from shared.io.private import private_folder
 from shared.store import Store
-from shared.store.crash_log import Underway
+from shared.store.crash_log import CrashLog
 
 OBJECT_STORE_BYTES = 128 << 20
-"""Only weights and receipts travel, so the smallest object store that Ray likes is ample."""
+"""Only weights and job results travel, so the smallest object store that Ray likes is ample."""
 ANSWER_S = 5.0
 """How long a cluster may take to answer."""
 AGENTS_S = 10.0
@@ -57,67 +57,67 @@ _SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 _SHARED_MEMORY = Path("/dev/shm")  # noqa: S108
 _OWNER_FILE = "owner"
 
-FleetMaker = Callable[[WorkerFactory, Underway], Fleet]
-"""Makes a fleet whose workers leave their breadcrumbs there."""
+FleetMaker = Callable[[WorkerFactory, CrashLog], WorkerGroup]
+"""Makes a worker group whose workers leave their heartbeats there."""
 
 logger = logging.getLogger(__name__)
 
 
 class Crew:
-    """The live fleet: one at a time, since each worker holds a CPU; kept as long as the store stays the same."""
+    """The live worker group: one at a time, since each worker holds a CPU; kept as long as the store stays the same."""
 
-    def __init__(self, make_fleet: FleetMaker) -> None:
-        self._make_fleet = make_fleet
-        self._fleet: Fleet | None = None
+    def __init__(self, make_worker_group: FleetMaker) -> None:
+        self._make_worker_group = make_worker_group
+        self._worker_group: WorkerGroup | None = None
         self._of: tuple[str, Path] | None = None
 
-    def for_store(self, store: Store, objects: Path) -> Fleet:
-        """The fleet whose workers write to `store`."""
-        if self._fleet is None or self._of != (store.where, objects):
+    def for_store(self, store: Store, objects: Path) -> WorkerGroup:
+        """The worker group whose workers write to `store`."""
+        if self._worker_group is None or self._of != (store.where, objects):
             self.dismiss()
-            self._fleet = self._make_fleet(partial(make_worker, store.where, objects), store.underway)
+            self._worker_group = self._make_worker_group(partial(make_worker, store.where, objects), store.crash_log)
             self._of = store.where, objects
-        return self._fleet
+        return self._worker_group
 
     def dismiss(self) -> None:
         """End the workers."""
-        if self._fleet is not None:
-            self._fleet.close()
-        self._fleet = None
+        if self._worker_group is not None:
+            self._worker_group.close()
+        self._worker_group = None
 
 
 @contextmanager
-def fleets(workers: int, limits: Limits, address: str | None = None) -> Iterator[FleetMaker]:
-    """A maker of fleets that live at most as long as the context: serial if `workers` is 0, else on Ray.
+def worker_groups(workers: int, limits: Limits, address: str | None = None) -> Iterator[FleetMaker]:
+    """A maker of worker groups that live at most as long as the context: serial if `workers` is 0, else on Ray.
 
-    Ray starts with the first fleet, so that what needs none does not wait for it.
+    Ray starts with the first worker group, so that what needs none does not wait for it.
 
     Args:
-        workers: how many actors a fleet has; 0 does without Ray.
+        workers: how many actors a worker group has; 0 does without Ray.
         limits: what a rollout may take.
         address: of a running Ray cluster; None starts a session of our own on this machine.
 
     Raises:
-        UsageError: as soon as a fleet is wanted, where Ray or SAPIEN is not installed.
+        UsageError: as soon as a worker group is wanted, where Ray or SAPIEN is not installed.
     """
     with ExitStack() as stack:
         begun = False
 
-        def make(make_worker: WorkerFactory, underway: Underway) -> Fleet:
+        def make(make_worker: WorkerFactory, crash_log: CrashLog) -> WorkerGroup:
             nonlocal begun
             if workers == 0:
                 require_packages("collecting", "sapien")
-                return SerialFleet(make_worker)
+                return SerialWorkerGroup(make_worker)
             # On a cluster, it is the workers that need SAPIEN.
             require_packages("collecting", "ray", *(["sapien"] if address is None else []))
             if not begun:
                 stack.enter_context(ray_session(workers, address))
                 begun = True
-            from cluster.workers.ray_group import RayFleet
+            from cluster.workers.ray_group import RayWorkerGroup
 
-            fleet = RayFleet(make_worker, underway, workers, limits)
-            stack.callback(fleet.close)
-            return fleet
+            worker_group = RayWorkerGroup(make_worker, crash_log, workers, limits)
+            stack.callback(worker_group.close)
+            return worker_group
 
         yield make
 

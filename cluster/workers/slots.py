@@ -1,6 +1,6 @@
-"""Seats of a fleet: a place for one actor each, what it was given to do, and who wants a job next.
+"""Slots of a worker group: a place for one actor each, what it was given to do, and who wants a job next.
 
-Whatever happens with one job takes the same time however many seats there are: seats are filed by what they want, and
+Whatever happens with one job takes the same time however many slots there are: slots are filed by what they want, and
 nothing here goes through all of them.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cluster.workers.job_queue import PlannedJob
-from shared.store.crash_log import Crumb, Underway
+from shared.store.crash_log import CrashLog, Heartbeat
 
 IN_FLIGHT = 2
 """Jobs an actor holds: one under way, one that waits so that the actor never idles for the driver's sake."""
@@ -24,7 +24,7 @@ class Task:
 
     Attributes:
         order: None if it is to arrive.
-        answer: its process's name, or the receipt.
+        answer: its process's name, or the job result.
     """
 
     order: PlannedJob | None
@@ -32,18 +32,18 @@ class Task:
 
 
 @dataclass(slots=True, eq=False)
-class Seat:
+class Slot:
     """A place for one actor, and what it was asked, oldest first."""
 
     actor: Any = None
     """None: the place is empty."""
     process: str = ""
-    """By which name its breadcrumbs go; "" until it is up."""
+    """By which name its heartbeats go; "" until it is up."""
     tasks: deque[Task] = field(default_factory=deque)
     busy_since: float = 0.0
     """When the actor was called, or the oldest task came to the head; `time.monotonic`."""
-    seen: tuple[Crumb | None, float] | None = None
-    """The last breadcrumb that was looked at, and since when it has been the same."""
+    seen: tuple[Heartbeat | None, float] | None = None
+    """The last heartbeat that was looked at, and since when it has been the same."""
     first_mb: float | None = None
     """What the process held after its first job."""
     retiring: bool = False
@@ -59,33 +59,33 @@ class Seat:
         self.tasks.popleft()
         self.busy_since, self.seen = time.monotonic(), None
 
-    def look(self, underway: Underway) -> tuple[Crumb | None, float]:
-        """The breadcrumb of the rollout under way, and since when it has been seen unchanged."""
-        crumb = underway.crumb_of(self.process)
-        if self.seen is None or self.seen[0] != crumb:
-            self.seen = crumb, time.monotonic()
+    def look(self, crash_log: CrashLog) -> tuple[Heartbeat | None, float]:
+        """The heartbeat of the rollout under way, and since when it has been seen unchanged."""
+        heartbeat = crash_log.heartbeat_of(self.process)
+        if self.seen is None or self.seen[0] != heartbeat:
+            self.seen = heartbeat, time.monotonic()
         return self.seen
 
-    def vacate(self) -> None:
+    def clear(self) -> None:
         """Forget the actor and all that was about it."""
         self.actor = self.seen = self.first_mb = None
         self.process, self.retiring = "", False
         self.tasks.clear()
 
 
-class Seats:
-    """All seats, filed by what they want; `file` one after each change."""
+class Slots:
+    """All slots, filed by what they want; `file` one after each change."""
 
     def __init__(self, count: int) -> None:
-        self._all = [Seat() for _ in range(count)]
+        self._all = [Slot() for _ in range(count)]
         # Unlike a plain dict's, its first entry is found at once, however many before that were removed.
-        self._empty = OrderedDict[Seat, None].fromkeys(self._all)
-        self._called = OrderedDict[Seat, None]()
-        self._hungry = tuple(OrderedDict[Seat, None]() for _ in range(IN_FLIGHT))
+        self._empty = OrderedDict[Slot, None].fromkeys(self._all)
+        self._called = OrderedDict[Slot, None]()
+        self._idle = tuple(OrderedDict[Slot, None]() for _ in range(IN_FLIGHT))
         """By how many jobs they hold."""
         self._next_look = 0
 
-    def __iter__(self) -> Iterator[Seat]:
+    def __iter__(self) -> Iterator[Slot]:
         return iter(self._all)
 
     @property
@@ -94,29 +94,29 @@ class Seats:
         return len(self._called)
 
     @property
-    def empty(self) -> Seat | None:
-        """A seat without an actor."""
+    def empty(self) -> Slot | None:
+        """A slot without an actor."""
         return next(iter(self._empty), None)
 
     @property
-    def hungriest(self) -> Seat | None:
-        """A seat that may be given a job; none gets a second one while another has none."""
-        return next((seat for hungry in self._hungry for seat in hungry), None)
+    def most_idle(self) -> Slot | None:
+        """A slot that may be given a job; none gets a second one while another has none."""
+        return next((slot for idle in self._idle for slot in idle), None)
 
-    def file(self, seat: Seat) -> None:
-        """Take note of what a seat wants now."""
-        for drawer in (self._empty, self._called, *self._hungry):
-            drawer.pop(seat, None)
-        if seat.actor is None:
-            self._empty[seat] = None
-        elif not seat.process:
-            self._called[seat] = None
-        elif not seat.retiring and len(seat.tasks) < IN_FLIGHT:
-            self._hungry[len(seat.tasks)][seat] = None
+    def file(self, slot: Slot) -> None:
+        """Take note of what a slot wants now."""
+        for drawer in (self._empty, self._called, *self._idle):
+            drawer.pop(slot, None)
+        if slot.actor is None:
+            self._empty[slot] = None
+        elif not slot.process:
+            self._called[slot] = None
+        elif not slot.retiring and len(slot.tasks) < IN_FLIGHT:
+            self._idle[len(slot.tasks)][slot] = None
 
-    def in_turn(self) -> Iterator[Seat]:
-        """Each seat once; whoever stops early is given the next ones another time."""
+    def in_turn(self) -> Iterator[Slot]:
+        """Each slot once; whoever stops early is given the next ones another time."""
         for _ in self._all:
-            seat = self._all[self._next_look]
+            slot = self._all[self._next_look]
             self._next_look = (self._next_look + 1) % len(self._all)
-            yield seat
+            yield slot

@@ -1,4 +1,4 @@
-"""Fleets: whoever executes the jobs of a plan. The serial one here, the Ray one in `cluster.workers.ray_group`.
+"""Worker groups: whoever executes the jobs of a plan. The serial one here, the Ray one in `cluster.workers.ray_group`.
 
     fleet.load_policy(1, files)                    # once a version
     fleet.run(orders, on_receipt=print)            # any number of times, on the same live workers
@@ -14,13 +14,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Protocol
 
-from cluster.workers.job_queue import Orders, PlannedJob
-from cluster.workers.retries import Backlog, Blame, Failure
-from collector.job_result import JobWorker, Receipt, WorkerFactory
+from cluster.workers.job_queue import JobQueue, PlannedJob
+from cluster.workers.retries import Backlog, Failure, RetryPolicy
+from collector.job_result import JobResult, JobWorker, WorkerFactory
 from shared.errors import AdaAffordError
 
 WAIT_S = 0.5
-"""How often a fleet that has nothing to do asks for orders."""
+"""How often a worker group that has nothing to do asks for orders."""
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ def make_worker(store: str | Path, objects: Path) -> JobWorker:
     return Worker(store, objects)
 
 
-class Fleet(Protocol):
+class WorkerGroup(Protocol):
     """Executes jobs on some number of workers."""
 
     workers: int
@@ -47,7 +47,7 @@ class Fleet(Protocol):
         """Hand the weights of policy `version` to every worker, present and future."""
         ...
 
-    def run(self, orders: Orders, on_receipt: Callable[[Receipt], None]) -> None:
+    def run(self, orders: JobQueue, on_result: Callable[[JobResult], None]) -> None:
         """Execute `orders` until they have ended, in any order, and report each once.
 
         They are taken no earlier than somebody is free for them, and asked for again where there is none yet. A rollout
@@ -64,11 +64,11 @@ class Fleet(Protocol):
         ...
 
 
-class SerialFleet:
+class SerialWorkerGroup:
     """One worker in this very process, without Ray: the same code for debugging, tests and tiny machines.
 
     Rollouts that raise are quarantined as everywhere. One that crashes ends this process, and one that hangs is waited
-    for, as in any program that is debugged; a fleet of processes survives both.
+    for, as in any program that is debugged; a worker group of processes survives both.
     """
 
     workers = 1
@@ -80,44 +80,44 @@ class SerialFleet:
         self._policies: dict[int, Mapping[str, bytes]] = {}
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
-        """See `Fleet.load_policy`."""
+        """See `WorkerGroup.load_policy`."""
         self._policies[version] = files
         if self._worker is not None:
             self._worker.load_policy(version, files)
 
-    def run(self, orders: Orders, on_receipt: Callable[[Receipt], None]) -> None:
-        """See `Fleet.run`."""
-        blame = Blame()
-        backlog = Backlog(orders, blame)
+    def run(self, orders: JobQueue, on_result: Callable[[JobResult], None]) -> None:
+        """See `WorkerGroup.run`."""
+        retries = RetryPolicy()
+        backlog = Backlog(orders, retries)
         while not backlog.ended:
             order = backlog.take(idle=True)
             if order is None:
                 time.sleep(WAIT_S)
-            elif (receipt := self._run(order, blame)) is None:
+            elif (job_result := self._run(order, retries)) is None:
                 backlog.put_back([order])
             else:
-                on_receipt(receipt)
+                on_result(job_result)
 
     def close(self) -> None:
-        """See `Fleet.close`."""
+        """See `WorkerGroup.close`."""
         self._worker = None
 
-    def _run(self, order: PlannedJob, blame: Blame) -> Receipt | None:
+    def _run(self, order: PlannedJob, retries: RetryPolicy) -> JobResult | None:
         """Try a job; None if it failed, which takes a fresh worker the next time."""
         job = order.job
         rollouts: list[int | None] = [None]
         try:
-            receipt = self._live_worker().run(order.plan, job, blame.quarantined(job), rollouts.append)
+            job_result = self._live_worker().run(order.plan, job, retries.quarantined(job), rollouts.append)
         except AdaAffordError:
             raise
         except Exception as error:
             logger.info("job %s failed", job.shard_id, exc_info=True)
             self._worker = None
             self.restarts += 1
-            blame.charge(job, Failure.of_exception(error, rollouts[-1]))
+            retries.record_failure(job, Failure.of_exception(error, rollouts[-1]))
             return None
-        blame.acquit(job)
-        return receipt
+        retries.reset(job)
+        return job_result
 
     def _live_worker(self) -> JobWorker:
         """The worker, made and given all policies if there is none yet."""

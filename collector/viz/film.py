@@ -217,12 +217,12 @@ def _capture(target: ArticulatedObject, take: Take, pose: Pose, side_deg: float)
     azimuth = np.rad2deg(np.arctan2(behind[1], behind[0])) if level > 0.3 else 180.0
     camera = camera_pose(float(azimuth) + side_deg, 25.0, CLOSE_UP.distance)
     camera[:3, 3] += take.action.point
-    hand = [_standing(shapes, place) for shapes, place in zip(take.hand, pose.hand, strict=True)]
+    hand = [_snapshot(shapes, place) for shapes, place in zip(take.hand, pose.hand, strict=True)]
     with_hand = ArticulatedObject(target.ref, (*target.bodies, *hand))
     return EmbreeCamera(with_hand, camera, CLOSE_UP).capture(np.append(pose.joint_positions, np.zeros(len(hand))))
 
 
-def _standing(shapes: Sequence[Mesh], world_from_link: Float) -> Body:
+def _snapshot(shapes: Sequence[Mesh], world_from_link: Float) -> Body:
     """A link of the hand as a body that stands where it is at joint position 0."""
     joint = Joint("", "prismatic", 0, world_from_link, np.array([1.0, 0.0, 0.0]), 0.0, 0.0)
     return Body("", "hand", joint, tuple(_closed(mesh) for mesh in shapes), ())

@@ -28,7 +28,7 @@ from learner.data.dataset import Dataset, Split, load_dataset, split, without_la
 from learner.data.features import FrozenFeatures
 from learner.settings import METRICS_FILE, LearnerConfig
 from learner.stages.oracle import read_oracle
-from learner.stages.trainers import AFFORDANCE_FOLDER, ORACLE_FILE, ORACLE_FOLDER, Recipe, Runner
+from learner.stages.trainers import AFFORDANCE_FOLDER, ORACLE_FILE, ORACLE_FOLDER, Runner, StageTrainer
 from learner.training import data_parallel
 from learner.training.checkpoint import check_fingerprint, read_cursor
 from learner.training.hardware import Hardware, hardware
@@ -211,7 +211,7 @@ def _train(
     with hardware.home():
         runner = Runner(job.out, config.seed, fingerprint, hardware)
         told = None if oracle is None else read_oracle(oracle, policy.config).to(hardware.device)
-        result = Recipe(config, policy, known, parts, runner, told).train(job.stage)
+        result = StageTrainer(config, policy, known, parts, runner, told).train(job.stage)
     policy.modules().to("cpu")
     policy.with_trained(job.stage)
     if data_parallel.rank() == 0:

@@ -61,7 +61,7 @@ class Runner:
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
+class StageTrainer:
     """What the stages have in common: a policy of which one module is trained, from what, and how.
 
     Attributes:
@@ -211,7 +211,7 @@ class BaselineTraining:
     """
 
     settings: type[TrainingConfig]
-    train: Callable[[Recipe, Any], TrainingResult]
+    train: Callable[[StageTrainer, Any], TrainingResult]
     row_critic: Callable[[Policy, FrozenFeatures], RowCritic]
     load: Callable[[Any], Load]
     table: str = ""

@@ -13,7 +13,7 @@ from learner.data.features import FrozenFeatures
 from learner.data.sampling import OrderedRows, draw_numbers, order_rows, spread
 from learner.metrics import discrimination
 from learner.settings import AdaptationConfig
-from learner.stages.trainers import BaselineTraining, Load, Recipe
+from learner.stages.trainers import BaselineTraining, Load, StageTrainer
 from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import correction_loss
@@ -129,7 +129,7 @@ class CorrectedScores:
         return corrected[0, :, -1].clamp(0.0, 1.0)
 
 
-def _train(recipe: Recipe, config: AdaptationConfig) -> TrainingResult:
+def _train(recipe: StageTrainer, config: AdaptationConfig) -> TrainingResult:
     network = recipe.policy.baseline(NAME, Where2ActAdaptation).requires_grad_(True)
     prior = FrozenPrior.of(recipe.policy.prior, recipe.known)
     return recipe.runner.train(AdaptationStage(network, recipe.dataset, recipe.parts, config, prior), config, NAME)

@@ -19,7 +19,7 @@ from learner.evaluation.critics import AdaptiveScores
 from learner.metrics import discrimination_in_chunks
 from learner.settings import InteractionConfig
 from learner.stages.affordance import AapCritic
-from learner.stages.trainers import BaselineTraining, Load, Recipe
+from learner.stages.trainers import BaselineTraining, Load, StageTrainer
 from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_loss
@@ -136,7 +136,7 @@ def spread_over(places: Float, actionability: Float32, count: int, rng: np.rando
     return np.array(chosen, dtype=np.int64)
 
 
-def _train(recipe: Recipe, config: InteractionConfig) -> TrainingResult:
+def _train(recipe: StageTrainer, config: InteractionConfig) -> TrainingResult:
     network = recipe.policy.baseline(NAME, Where2ActInteraction).requires_grad_(True)
     pool, prior = recipe.pool(), FrozenPrior.of(recipe.policy.prior, recipe.known)
     stage = InteractionStage(network, recipe.dataset, recipe.parts, config, prior)

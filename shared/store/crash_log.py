@@ -1,13 +1,13 @@
-"""What is under way: a breadcrumb of each worker's rollout, and the last words of workers that crashed.
+"""What is under way: a heartbeat of each worker's rollout, and the crash log of workers that crashed.
 
     STORE/underway/<process>.json    the rollout that this process executes at this moment
     STORE/underway/<process>.fault   where it was when it crashed or hung; empty as long as all is well
 
 They lie in the store since that is all that workers and driver are sure to share. A file is named by the process that
 wrote it, so that none is ever taken for another's, however many have tried the same rollout. Nothing here is forced to
-the disk: a breadcrumb matters after the end of a process, not of a machine.
+the disk: a heartbeat matters after the end of a process, not of a machine.
 
-Of a store in a bucket the breadcrumbs lie there too, but last words cannot: a handler of signals writes to an open file
+Of a store in a bucket the heartbeats lie there too, but crash log cannot: a handler of signals writes to an open file
 and no further. They stay on the worker's machine, in a folder of its user alone (`shared.io.private`), and a driver on
 another one takes a crash for a loss.
 """
@@ -28,16 +28,16 @@ from shared.io.files import DAY_S, is_abandoned, is_gone, process_name, read_bou
 from shared.io.private import private_folder
 
 if TYPE_CHECKING:
-    from shared.store.backends.base import Place
+    from shared.store.backends.base import StorageBackend
 
-UNDERWAY_FOLDER = "underway"
+CRASH_LOG_FOLDER = "underway"
 
 _ABANDONED_S = 30 * DAY_S
 """A worker of another machine may wait for its next job for days, while a policy is trained."""
 _WORKER_SILENT_S = 600.0
 """A worker says before each rollout what it does; hardly any takes longer."""
-_CRUMB, _FAULT = ".json", ".fault"
-_CRUMB_BYTES = 256
+_HEARTBEAT, _FAULT = ".json", ".fault"
+_HEARTBEAT_BYTES = 256
 _MAX_BYTES = 1 << 16
 _FRAMES = 2
 """Frames of a traceback that a reason names, from the innermost outwards."""
@@ -45,7 +45,7 @@ _FRAME = re.compile(r'  File "(?P<file>[^"]*)", line (?P<line>\d+) in (?P<functi
 _TIMEOUT = re.compile(r"Timeout \((?P<limit>[\d:.]+)\)!")
 
 
-class Crumb(StrictModel):
+class Heartbeat(StrictModel):
     """What a process is doing."""
 
     shard_id: str = Field(max_length=100)
@@ -57,11 +57,11 @@ class Crumb(StrictModel):
 
 
 @dataclass(frozen=True, slots=True)
-class Underway:
+class CrashLog:
     """What is under way in one store.
 
     Attributes:
-        folder: of the breadcrumbs and last words; None: of a store in a bucket, whose last words each machine keeps in
+        folder: of the heartbeats and crash log; None: of a store in a bucket, whose crash log each machine keeps in
             its user's private folder.
         url: of a store in a bucket.
 
@@ -73,7 +73,7 @@ class Underway:
     folder: Path | None
     url: str = ""
 
-    def leave(self, crumb: Crumb) -> None:
+    def leave(self, heartbeat: Heartbeat) -> None:
         """Say what this process does now.
 
         Raises:
@@ -81,20 +81,20 @@ class Underway:
             OSError: the file cannot be written; no older one is then left that would blame the wrong rollout.
         """
         if self.url:
-            _place(self.url).replace(_key(process_name()), crumb.model_dump_json().encode())
+            _place(self.url).replace(_key(process_name()), heartbeat.model_dump_json().encode())
             return
-        file = self._file(process_name(), _CRUMB)
+        file = self._file(process_name(), _HEARTBEAT)
         try:
-            _overwrite(file, crumb.model_dump_json().encode())
+            _overwrite(file, heartbeat.model_dump_json().encode())
         except FileNotFoundError:
             file.parent.mkdir(exist_ok=True)
-            _overwrite(file, crumb.model_dump_json().encode())
+            _overwrite(file, heartbeat.model_dump_json().encode())
         except OSError:
             file.unlink(missing_ok=True)
             raise
 
     def open_fault_log(self) -> IO[bytes]:
-        """A file for the last words of this process, as `faulthandler` writes them.
+        """A file for the crash log of this process, as `faulthandler` writes them.
 
         Raises:
             UsageError: there is no private folder on this machine, for a store in a bucket.
@@ -104,19 +104,19 @@ class Underway:
         file.parent.mkdir(exist_ok=True)
         return os.fdopen(_open(file, os.O_TRUNC), "wb", buffering=0)
 
-    def crumb_of(self, process: str) -> Crumb | None:
-        """What a process does, or did when it ended; None if it left no breadcrumb, or half of one."""
+    def heartbeat_of(self, process: str) -> Heartbeat | None:
+        """What a process does, or did when it ended; None if it left no heartbeat, or half of one."""
         try:
-            return Crumb.model_validate_json(self._read_crumb(process))
+            return Heartbeat.model_validate_json(self._read_heartbeat(process))
         except ValidationError:
             return None
 
-    def crumbs(self) -> dict[str, Crumb]:
+    def heartbeats(self) -> dict[str, Heartbeat]:
         """What each process does that has not been forgotten, by its name."""
-        names = _place(self.url).names(UNDERWAY_FOLDER) if self.url else sorted(file.name for file in self._files())
-        processes = [name.removesuffix(_CRUMB) for name in names if name.endswith(_CRUMB)]
-        found = {process: self.crumb_of(process) for process in processes}
-        return {process: crumb for process, crumb in found.items() if crumb is not None}
+        names = _place(self.url).names(CRASH_LOG_FOLDER) if self.url else sorted(file.name for file in self._files())
+        processes = [name.removesuffix(_HEARTBEAT) for name in names if name.endswith(_HEARTBEAT)]
+        found = {process: self.heartbeat_of(process) for process in processes}
+        return {process: heartbeat for process, heartbeat in found.items() if heartbeat is not None}
 
     def fault_of(self, process: str) -> str:
         """Of what a process died, in one line; "" if nothing within it brought it about."""
@@ -126,24 +126,24 @@ class Underway:
         """Remove what a process left."""
         if self.url:
             _place(self.url).remove(_key(process))
-        for suffix in (_CRUMB, _FAULT):
+        for suffix in (_HEARTBEAT, _FAULT):
             self._file(process, suffix).unlink(missing_ok=True)
 
     def sweep(self) -> int:
         """Remove what ended processes left, as far as that can be told; returns how many files that was."""
-        crumbs = [process for process in self.crumbs() if is_gone(process)] if self.url else []
+        heartbeats = [process for process in self.heartbeats() if is_gone(process)] if self.url else []
         files = [file for file in self._files() if is_abandoned(file, file.stem, _ABANDONED_S)]
-        for process in crumbs:
+        for process in heartbeats:
             _place(self.url).remove(_key(process))
         for file in files:
             file.unlink(missing_ok=True)
-        return len(crumbs) + len(files)
+        return len(heartbeats) + len(files)
 
     def _home(self) -> Path:
         """The folder of this machine's files."""
         if self.folder is not None:
             return self.folder
-        return private_folder(f"{UNDERWAY_FOLDER}-{hashlib.sha256(self.url.encode()).hexdigest()[:16]}")
+        return private_folder(f"{CRASH_LOG_FOLDER}-{hashlib.sha256(self.url.encode()).hexdigest()[:16]}")
 
     def _files(self) -> list[Path]:
         home = self._home()
@@ -153,9 +153,9 @@ class Underway:
         # Not `with_suffix`: a host's name may hold dots.
         return self._home() / f"{process}{suffix}"
 
-    def _read_crumb(self, process: str) -> bytes:
+    def _read_heartbeat(self, process: str) -> bytes:
         if not self.url:
-            return self._read(process, _CRUMB)
+            return self._read(process, _HEARTBEAT)
         try:
             return _place(self.url).read(_key(process), _MAX_BYTES)
         except StoreError:
@@ -169,37 +169,41 @@ class Underway:
 
 
 def workers_at_work(url: str, now: float) -> list[str]:
-    """Processes that leave breadcrumbs in a bucket and have not ended, as far as that can be told from here.
+    """Processes that leave heartbeats in a bucket and have not ended, as far as that can be told from here.
 
     Args:
         url: of the store.
         now: seconds since 1970.
     """
-    crumbs = Underway(Path(), url).crumbs()
-    return [name for name, crumb in crumbs.items() if not is_gone(name) and now - crumb.written < _WORKER_SILENT_S]
+    heartbeats = CrashLog(Path(), url).heartbeats()
+    return [
+        name
+        for name, heartbeat in heartbeats.items()
+        if not is_gone(name) and now - heartbeat.written < _WORKER_SILENT_S
+    ]
 
 
 @cache
-def _place(url: str) -> "Place":
+def _place(url: str) -> "StorageBackend":
     """A bucket, whose client cannot travel between processes."""
-    from shared.store.backends.base import place_of
+    from shared.store.backends.base import backend_of
 
-    return place_of(url)
+    return backend_of(url)
 
 
 def _key(process: str) -> str:
-    """Of a breadcrumb, in a bucket."""
-    return f"{UNDERWAY_FOLDER}/{process}{_CRUMB}"
+    """Of a heartbeat, in a bucket."""
+    return f"{CRASH_LOG_FOLDER}/{process}{_HEARTBEAT}"
 
 
 def _overwrite(file: Path, data: bytes) -> None:
-    """Put a breadcrumb in the place of the last one."""
+    """Put a heartbeat in the place of the last one."""
     # Neither truncated nor renamed over: file systems take either for a wish to have it on the disk at once, which
     # costs milliseconds. Blanks cover what was there before, and JSON ignores them.
-    assert len(data) <= _CRUMB_BYTES
+    assert len(data) <= _HEARTBEAT_BYTES
     descriptor = _open(file)
     try:
-        os.write(descriptor, data.ljust(_CRUMB_BYTES))
+        os.write(descriptor, data.ljust(_HEARTBEAT_BYTES))
     finally:
         os.close(descriptor)
 

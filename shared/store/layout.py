@@ -9,7 +9,7 @@
         observations.zarr/           the clouds
         manifest.json                counts, checksums, content digests, provenance; written last
       policies/<version>/            whatever the learner publishes, and index.json
-      underway/                      breadcrumbs of live workers (`shared.store.crash_log`); no data
+      underway/                      heartbeats of live workers (`shared.store.crash_log`); no data
       status/                        how the last collection stands (`cluster.collection.status_writer`); no data
       aside/                         what `store repair` or `store compact` took out; no data, and nothing reads it
 
@@ -27,7 +27,7 @@ from shared.config import StrictModel
 from shared.errors import SchemaVersionError, StoreError
 from shared.io.documents import MAX_VALUES, parse_object, problem_of
 from shared.plan import Job, Setting
-from shared.store.codecs.checksummed import is_sealed, unsealed
+from shared.store.codecs.checksummed import checked_content, has_checksum
 
 SCHEMA_VERSION = 1
 """What the number promises, and when it grows, is told in docs/compatibility.md."""
@@ -171,7 +171,7 @@ def parse_sealed(model: type[Document], data: bytes, source: str, what: str, val
     if "schema_version" in model.model_fields:
         check_schema_version(content, source)
     try:
-        return model.model_validate(unsealed(content, data, source), extra="allow")
+        return model.model_validate(checked_content(content, data, source), extra="allow")
     except ValidationError as error:
         raise StoreError(f"{source}: not {what} ({problem_of(error)}); the file is damaged or foreign") from None
 
@@ -198,7 +198,7 @@ def check_schema_version(content: dict[str, Any], source: str) -> None:
     if version in versions and type(version) is int:
         return
     # A flipped bit in the number itself is damage: with the right number, the document is what was sealed.
-    if not isinstance(version, int) or any(is_sealed(content | {"schema_version": right}) for right in versions):
+    if not isinstance(version, int) or any(has_checksum(content | {"schema_version": right}) for right in versions):
         raise StoreError(f"{source}: names no schema version; the file is damaged: restore it from a copy")
     older = (
         "run `adaafford store migrate STORE --out NEW`"

@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping
 
 from shared.config import StrictModel
 from shared.errors import StoreError
-from shared.store.backends.base import Folder, Place, Publication
-from shared.store.codecs.checksummed import seal
+from shared.store.backends.base import Folder, StorageBackend, Transaction
+from shared.store.codecs.checksummed import with_checksum
 from shared.store.layout import MAX_DOCUMENT_BYTES, POLICIES_FOLDER, SCHEMA_VERSION, FileEntry, parse_sealed
 
 INDEX_FILE = "index.json"
@@ -24,7 +24,7 @@ class PolicyIndex(StrictModel):
     files: dict[str, FileEntry]
 
 
-def publish_policy(place: Place, version: int, files: Mapping[str, bytes]) -> None:
+def publish_policy(backend: StorageBackend, version: int, files: Mapping[str, bytes]) -> None:
     """Put a policy's files into the store, all or none; publishing the same again changes nothing.
 
     Raises:
@@ -37,37 +37,37 @@ def publish_policy(place: Place, version: int, files: Mapping[str, bytes]) -> No
             raise StoreError(f"policy file {name!r} is not allowed; use lower-case letters, digits, '.', '_' and '-'")
     if not files or sum(map(len, files.values())) > MAX_POLICY_BYTES:
         raise StoreError(f"policy {version}: needs at least one file, and at most {MAX_POLICY_BYTES} bytes in all")
-    folder = _folder(place, version)
+    folder = _folder(backend, version)
 
     def describe(held: Mapping[str, bytes]) -> bytes:
         if held != files:
             raise StoreError(f"{folder}: another attempt left other files here; run `adaafford store repair`")
         return _index(version, held)
 
-    published = place.publish(
-        Publication(folder.key, files, INDEX_FILE, describe=describe, admit=lambda: None, lock="policies")
+    published = backend.publish(
+        Transaction(folder.key, files, INDEX_FILE, describe=describe, check=lambda: None, lock="policies")
     )
-    if not published and read_policy(place, version) != dict(files):
+    if not published and read_policy(backend, version) != dict(files):
         raise StoreError(f"{folder}: exists with other content; publish under the next version")
 
 
 def _index(version: int, files: Mapping[str, bytes]) -> bytes:
-    return seal(PolicyIndex(version=version, files=_entries(files)).as_document())
+    return with_checksum(PolicyIndex(version=version, files=_entries(files)).as_document())
 
 
 def _entries(files: Mapping[str, bytes]) -> dict[str, FileEntry]:
     return {n: FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) for n, data in files.items()}
 
 
-def read_policy(place: Place, version: int) -> dict[str, bytes]:
+def read_policy(backend: StorageBackend, version: int) -> dict[str, bytes]:
     """A policy's files, of the sizes and checksums that its index states.
 
     Raises:
         StoreError: there is no such policy, or it is damaged.
         SchemaVersionError: its index is of another schema version.
     """
-    folder = _folder(place, version)
-    index = _read_index(place, version)
+    folder = _folder(backend, version)
+    index = _read_index(backend, version)
     contents = folder.read_all([(name, entry.size) for name, entry in index.files.items()])
     return {
         name: _checked(f"{folder}/{name}", data, index.files[name])
@@ -75,11 +75,11 @@ def read_policy(place: Place, version: int) -> dict[str, bytes]:
     }
 
 
-def version_of(place: Place, files: Mapping[str, bytes], besides: Collection[int] = ()) -> int | None:
+def version_of(backend: StorageBackend, files: Mapping[str, bytes], besides: Collection[int] = ()) -> int | None:
     """The first version that was published with exactly these files; None if there is none.
 
     Args:
-        place: of the store.
+        backend: of the store.
         files: of the policy.
         besides: versions that do not count.
 
@@ -87,14 +87,14 @@ def version_of(place: Place, files: Mapping[str, bytes], besides: Collection[int
         StoreError: an index is damaged.
     """
     entries = _entries(files)
-    alike = (v for v in policy_versions(place) if v not in besides and _read_index(place, v).files == entries)
+    alike = (v for v in policy_versions(backend) if v not in besides and _read_index(backend, v).files == entries)
     return next(alike, None)
 
 
-def _read_index(place: Place, version: int) -> PolicyIndex:
-    folder = _folder(place, version)
+def _read_index(backend: StorageBackend, version: int) -> PolicyIndex:
+    folder = _folder(backend, version)
     if not folder.has(INDEX_FILE):
-        known = ", ".join(str(v) for v in policy_versions(place)) or "none"
+        known = ", ".join(str(v) for v in policy_versions(backend)) or "none"
         raise StoreError(f"{folder}: there is no policy {version}; published: {known}")
     path = f"{folder}/{INDEX_FILE}"
     index = parse_sealed(PolicyIndex, folder.read(INDEX_FILE, MAX_DOCUMENT_BYTES), path, "the index of a policy")
@@ -104,11 +104,11 @@ def _read_index(place: Place, version: int) -> PolicyIndex:
     return index
 
 
-def policy_versions(place: Place) -> tuple[int, ...]:
+def policy_versions(backend: StorageBackend) -> tuple[int, ...]:
     """The versions that are published, in order."""
-    versions = [int(name) for name in place.names(POLICIES_FOLDER) if re.fullmatch(r"[0-9]{6}", name)]
-    if place.writes_in_place:
-        versions = [version for version in versions if _folder(place, version).has(INDEX_FILE)]
+    versions = [int(name) for name in backend.names(POLICIES_FOLDER) if re.fullmatch(r"[0-9]{6}", name)]
+    if backend.writes_in_place:
+        versions = [version for version in versions if _folder(backend, version).has(INDEX_FILE)]
     return tuple(versions)
 
 
@@ -121,8 +121,8 @@ def _allowed(name: str) -> bool:
     return _FILE_NAME.fullmatch(name) is not None and name != INDEX_FILE
 
 
-def _folder(place: Place, version: int) -> Folder:
-    return Folder(place, f"{POLICIES_FOLDER}/{folder_name(version)}")
+def _folder(backend: StorageBackend, version: int) -> Folder:
+    return Folder(backend, f"{POLICIES_FOLDER}/{folder_name(version)}")
 
 
 def _checked(path: str, data: bytes, entry: FileEntry) -> bytes:

@@ -17,7 +17,7 @@ from shared.config import StrictModel
 from shared.errors import MissingError, StoreError, UsageError
 from shared.heartbeat import Heartbeat
 from shared.io.files import is_gone, process_name
-from shared.store.backends.base import Place
+from shared.store.backends.base import StorageBackend
 from shared.store.crash_log import workers_at_work
 from shared.store.layout import STATUS_FOLDER
 
@@ -45,11 +45,11 @@ class Mark(StrictModel):
 
 
 @contextmanager
-def present(place: Place, name: str, *, alone: bool) -> Iterator[None]:
+def present(backend: StorageBackend, name: str, *, alone: bool) -> Iterator[None]:
     """Hold a place without locks: leave a mark, look for others, and renew the mark as long as the context lasts.
 
     Args:
-        place: where the mark lies.
+        backend: where the mark lies.
         name: what is held.
         alone: whether there must be no other holder; without it, there may be others of this kind.
 
@@ -60,7 +60,7 @@ def present(place: Place, name: str, *, alone: bool) -> Iterator[None]:
 
     def write() -> None:
         mark = Mark(process=process_name(), alone=alone, written=time.time())
-        place.replace(own, mark.model_dump_json().encode())
+        backend.replace(own, mark.model_dump_json().encode())
 
     def renew() -> None:
         # The work itself meets whatever is wrong with the place.
@@ -69,9 +69,9 @@ def present(place: Place, name: str, *, alone: bool) -> Iterator[None]:
 
     write()
     try:
-        _refuse_others(place, name, own, alone=alone)
+        _refuse_others(backend, name, own, alone=alone)
     except BaseException:
-        place.remove(own)
+        backend.remove(own)
         raise
     try:
         with Heartbeat(renew, lambda _: BEAT_S, "presence"):
@@ -79,33 +79,33 @@ def present(place: Place, name: str, *, alone: bool) -> Iterator[None]:
     finally:
         # Where that fails it is silent from now on, which says the same some seconds later.
         with suppress(StoreError):
-            place.remove(own)
+            backend.remove(own)
 
 
-def _refuse_others(place: Place, name: str, own: str, *, alone: bool) -> None:
-    for key, mark in _others(place, name, own):
+def _refuse_others(backend: StorageBackend, name: str, own: str, *, alone: bool) -> None:
+    for key, mark in _others(backend, name, own):
         if not mark.is_alive(time.time()):
-            place.remove(key)
+            backend.remove(key)
         elif mark.alone or alone:
             raise UsageError(
-                f"{place.where} is in use by process {mark.process}; wait for it or stop it "
+                f"{backend.where} is in use by process {mark.process}; wait for it or stop it "
                 f"(one that was killed is forgotten after {SILENT_S:.0f} s)"
             )
 
 
-def _others(place: Place, name: str, own: str) -> Iterator[tuple[str, Mark]]:
-    for each in place.names(STATUS_FOLDER):
+def _others(backend: StorageBackend, name: str, own: str) -> Iterator[tuple[str, Mark]]:
+    for each in backend.names(STATUS_FOLDER):
         key = f"{STATUS_FOLDER}/{each}"
         if not each.startswith(f"{name}-") or key == own:
             continue
         try:
-            yield key, Mark.model_validate_json(place.read(key, _MAX_MARK_BYTES))
+            yield key, Mark.model_validate_json(backend.read(key, _MAX_MARK_BYTES))
         except (MissingError, ValidationError):
             continue  # It has ended meanwhile, or it is no mark.
 
 
 @contextmanager
-def alone(place: Place) -> Iterator[None]:
+def alone(backend: StorageBackend) -> Iterator[None]:
     """Hold a store against drivers, against others who must be alone, and in a bucket against workers as well.
 
     On a disk a worker that has lost its driver does no harm: its shard is renamed to its place as a whole.
@@ -113,10 +113,10 @@ def alone(place: Place) -> Iterator[None]:
     Raises:
         UsageError: somebody is at work; the message names the process.
     """
-    with place.only_one(DRIVER, alone=True):
-        for process in workers_at_work(place.where, time.time()) if place.writes_in_place else ():
+    with backend.only_one(DRIVER, alone=True):
+        for process in workers_at_work(backend.where, time.time()) if backend.writes_in_place else ():
             raise UsageError(
-                f"{place.where} is in use by worker process {process}, whose driver has ended; stop that process, or "
+                f"{backend.where} is in use by worker process {process}, whose driver has ended; stop that process, or "
                 "wait until it has been silent for ten minutes"
             )
         yield

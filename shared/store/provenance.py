@@ -18,7 +18,7 @@ from pathlib import Path
 
 from shared.errors import StoreError
 from shared.io.files import host_name, machine_name
-from shared.store.backends.base import Place
+from shared.store.backends.base import StorageBackend
 from shared.store.codecs.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, fingerprint
 from shared.store.layout import STATUS_FOLDER
 
@@ -53,16 +53,16 @@ def process_provenance() -> dict[str, str]:
     return {"machine": machine_name(), "pid": str(os.getpid())}
 
 
-def note_machine(place: Place) -> None:
+def note_machine(backend: StorageBackend) -> None:
     """Write down in a store which host this machine is; nothing depends on it, so it is no error if that fails."""
     with suppress(StoreError, OSError):
-        place.create(_key(machine_name()), json.dumps({"host": host_name()}).encode())
+        backend.create(_key(machine_name()), json.dumps({"host": host_name()}).encode())
 
 
-def host_of(place: Place, process: str) -> str:
+def host_of(backend: StorageBackend, process: str) -> str:
     """The host of a process, by its `shared.io.files.process_name`; "" if the store does not know it."""
     try:
-        found = json.loads(place.read(_key(process.partition("-")[0]), _MAX_NOTE_BYTES))["host"]
+        found = json.loads(backend.read(_key(process.partition("-")[0]), _MAX_NOTE_BYTES))["host"]
     except (StoreError, ValueError, KeyError, TypeError, RecursionError):
         return ""
     return found if isinstance(found, str) else ""

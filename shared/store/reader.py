@@ -12,7 +12,7 @@ from pydantic_core import from_json
 from shared.errors import StoreError
 from shared.plan import Job, ObjectRef
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
-from shared.store.backends.base import Folder, Place
+from shared.store.backends.base import Folder, StorageBackend
 from shared.store.codecs import observations
 from shared.store.codecs.columns import INTERACTION_COLUMNS, MAX_TEXT, ROLLOUT_COLUMNS, added_in, hidden_names
 from shared.store.codecs.observations import ObservationArrays
@@ -49,9 +49,9 @@ _BATCH = 128
 """Shards whose manifests or tables are in memory at once."""
 
 
-def shard_folder(place: Place, shard_id: str) -> Folder:
+def shard_folder(backend: StorageBackend, shard_id: str) -> Folder:
     """Where a shard lies, or would."""
-    return Folder(place, f"{SHARDS_FOLDER}/{shard_id}")
+    return Folder(backend, f"{SHARDS_FOLDER}/{shard_id}")
 
 
 def is_committed(shard: Folder) -> bool:
@@ -59,32 +59,32 @@ def is_committed(shard: Folder) -> bool:
     return shard.has(MANIFEST_FILE)
 
 
-def named_jobs(place: Place, plan_key: str | None = None) -> Iterator[Job]:
+def named_jobs(backend: StorageBackend, plan_key: str | None = None) -> Iterator[Job]:
     """The jobs that folders are called by, committed or not, in order of name."""
-    for name in place.names(SHARDS_FOLDER):
+    for name in backend.names(SHARDS_FOLDER):
         job = parse_shard_id(name)
         if job is not None and plan_key in (None, job.plan_key):
             yield job
 
 
-def committed_jobs(place: Place, plan_key: str | None = None) -> list[Job]:
+def committed_jobs(backend: StorageBackend, plan_key: str | None = None) -> list[Job]:
     """The jobs whose shards are committed, in order of name, by the shards' names alone."""
     found = []
-    for jobs in _batches(named_jobs(place, plan_key)):
-        there = place.exist([f"{SHARDS_FOLDER}/{job.shard_id}/{MANIFEST_FILE}" for job in jobs])
+    for jobs in _batches(named_jobs(backend, plan_key)):
+        there = backend.exist([f"{SHARDS_FOLDER}/{job.shard_id}/{MANIFEST_FILE}" for job in jobs])
         found += [job for job, is_there in zip(jobs, there, strict=True) if is_there]
     return found
 
 
-def read_manifests(place: Place, jobs: Iterable[Job]) -> Iterator[ShardManifest]:
+def read_manifests(backend: StorageBackend, jobs: Iterable[Job]) -> Iterator[ShardManifest]:
     """The manifests of some committed shards, in their order; a bucket gives several at once.
 
     Raises:
         StoreError: one is damaged, foreign, of another schema version, or another shard's.
     """
     for batch in _batches(jobs):
-        shards = [shard_folder(place, job.shard_id) for job in batch]
-        contents = place.read_all([(f"{shard.key}/{MANIFEST_FILE}", MAX_DOCUMENT_BYTES) for shard in shards])
+        shards = [shard_folder(backend, job.shard_id) for job in batch]
+        contents = backend.read_all([(f"{shard.key}/{MANIFEST_FILE}", MAX_DOCUMENT_BYTES) for shard in shards])
         for shard, data in zip(shards, contents, strict=True):
             yield checked_manifest(shard, data)
 
@@ -163,12 +163,12 @@ def read_rollout_table(shard: Folder, manifest: ShardManifest) -> Any:
 
 
 def read_tables(
-    place: Place, parts: Iterable[Part], file: str, names: Sequence[str] | None = None
+    backend: StorageBackend, parts: Iterable[Part], file: str, names: Sequence[str] | None = None
 ) -> Iterator[tuple[Part, ShardManifest, Any]]:
     """One of the two tables of many shards, with the rows that count; a bucket gives several at once.
 
     Args:
-        place: of the store.
+        backend: of the store.
         parts: what counts of which shard.
         file: which table.
         names: read these columns only.
@@ -177,10 +177,10 @@ def read_tables(
         StoreError: a file is damaged or foreign.
     """
     for batch in _batches(parts):
-        manifests = list(read_manifests(place, [part.shard for part in batch]))
-        shards = [shard_folder(place, manifest.shard_id) for manifest in manifests]
+        manifests = list(read_manifests(backend, [part.shard for part in batch]))
+        shards = [shard_folder(backend, manifest.shard_id) for manifest in manifests]
         wanted = [(f"{shard.key}/{file}", m.files[file].size) for shard, m in zip(shards, manifests, strict=True)]
-        for part, shard, manifest, data in zip(batch, shards, manifests, place.read_all(wanted), strict=True):
+        for part, shard, manifest, data in zip(batch, shards, manifests, backend.read_all(wanted), strict=True):
             read = names if names is None or part.is_whole else list(dict.fromkeys([*names, ROLLOUT_COLUMN]))
             table = part.of(_table(shard, manifest, file, _checked(shard, manifest, file, data), read))
             yield part, manifest, table if names is None else table.select(list(names))

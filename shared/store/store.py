@@ -22,15 +22,15 @@ from shared.io.files import TEMPORARY_PREFIX
 from shared.plan import Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import policies, reader
-from shared.store.backends.base import Folder, Place, is_url, place_of
+from shared.store.backends.base import Folder, StorageBackend, backend_of, is_url
 from shared.store.backends.conformance import check_place
-from shared.store.codecs.checksummed import seal
+from shared.store.codecs.checksummed import with_checksum
 from shared.store.codecs.columns import added_in, interaction_columns, rollout_columns
 from shared.store.codecs.digest import combined_digest
 from shared.store.codecs.observations import ObservationArrays
 from shared.store.codecs.tables import schema_of
 from shared.store.coverage import Part, parts_of
-from shared.store.crash_log import UNDERWAY_FOLDER, Underway
+from shared.store.crash_log import CRASH_LOG_FOLDER, CrashLog
 from shared.store.layout import (
     INTERACTIONS_FILE,
     LOCK_PREFIX,
@@ -60,9 +60,9 @@ _TABLES_AT_ONCE = 256
 class Store:
     """A folder of immutable shards, all of one setting. Any number of processes may use it at once."""
 
-    def __init__(self, place: Place, document: StoreDocument) -> None:
+    def __init__(self, backend: StorageBackend, document: StoreDocument) -> None:
         """Use `Store.create` or `Store.open`."""
-        self.place = place
+        self.backend = backend
         self.document = document
         self._recorded: dict[str, Plan] = {}
         self._snapshot: Snapshot | None = None
@@ -70,7 +70,7 @@ class Store:
     @property
     def where(self) -> str:
         """What people call the store's place: a folder or a URL; `Store.open` takes it."""
-        return self.place.where
+        return self.backend.where
 
     @property
     def setting(self) -> Setting:
@@ -93,17 +93,17 @@ class Store:
         """
         if setting.seed > MAX_SEED:
             raise UsageError(f"seed {setting.seed} is too large; allowed: 0 to {MAX_SEED}")
-        place = place_of(where)
+        backend = backend_of(where)
         try:
-            if not place.exists(STORE_FILE):
-                _refuse_foreign(place)
-                if place.writes_in_place:
+            if not backend.exists(STORE_FILE):
+                _refuse_foreign(backend)
+                if backend.writes_in_place:
                     # Only what a server promises keeps two writers of a shard apart there; some break it.
-                    check_place(place)
+                    check_place(backend)
                 created = datetime.now(UTC).isoformat(timespec="seconds")
                 known = {"setting": setting, "software": store_software(), "created": created}
                 document = StoreDocument.model_validate(dict(more or {}) | known, extra="allow")
-                place.create(STORE_FILE, seal(document.as_document()))
+                backend.create(STORE_FILE, with_checksum(document.as_document()))
         except OSError as error:
             raise StoreError(f"{where}: no store can be made here ({error.strerror}); name another folder") from None
         store = cls.open(where)
@@ -123,16 +123,16 @@ class Store:
             StoreError: it is missing, no store, damaged, or of another schema version.
             UsageError: the URL is not allowed.
         """
-        place = place_of(where)
-        if not place.is_there():
+        backend = backend_of(where)
+        if not backend.is_there():
             raise StoreError(f"{where}: there is no such folder; name an existing store")
-        if not place.exists(STORE_FILE):
+        if not backend.exists(STORE_FILE):
             raise StoreError(f"{where}: is no store (it has no {STORE_FILE}); name an existing store")
-        return cls(place, parse_store_document(place.read(STORE_FILE, MAX_DOCUMENT_BYTES), f"{where}/{STORE_FILE}"))
+        return cls(backend, parse_store_document(backend.read(STORE_FILE, MAX_DOCUMENT_BYTES), f"{where}/{STORE_FILE}"))
 
     def as_of(self, snapshot: Snapshot) -> "Store":
         """The store as it was when it held these rollouts, for whoever reads it while others add to it."""
-        store = Store(self.place, self.document)
+        store = Store(self.backend, self.document)
         store._snapshot = snapshot
         return store
 
@@ -148,7 +148,7 @@ class Store:
             difference = difference_of(self.setting.as_document(), plan.setting.as_document())
             raise StoreError(f"{self.where}: plan {plan.key} is of another setting: {difference}")
         key = f"{PLANS_FOLDER}/{plan.key}.json"
-        made = self.place.create(key, seal(plan.as_document()))
+        made = self.backend.create(key, with_checksum(plan.as_document()))
         # Compared as plans: a setting that came with later software has its default in a file that lacks it.
         if not made and self.read_plan(f"{plan.key}.json") != plan:
             raise StoreError(f"{self.where}/{key}: holds another plan of this name; give this one another store")
@@ -160,7 +160,7 @@ class Store:
         Raises:
             StoreError: a file is damaged or foreign.
         """
-        names = [name for name in self.place.names(PLANS_FOLDER) if not name.startswith(".")]
+        names = [name for name in self.backend.names(PLANS_FOLDER) if not name.startswith(".")]
         return tuple(self.read_plan(name) for name in names if name.endswith(".json"))
 
     def read_plan(self, name: str) -> Plan:
@@ -171,7 +171,7 @@ class Store:
         """
         key = f"{PLANS_FOLDER}/{name}"
         file = f"{self.where}/{key}"
-        plan = parse_sealed(Plan, self.place.read(key, MAX_DOCUMENT_BYTES), file, "a plan")
+        plan = parse_sealed(Plan, self.backend.read(key, MAX_DOCUMENT_BYTES), file, "a plan")
         if f"{plan.key}.json" != name or plan.setting != self.setting:
             raise StoreError(f"{file}: is no plan of this store; the file is damaged or foreign")
         return plan
@@ -188,21 +188,21 @@ class Store:
         Raises:
             StoreError: a manifest is damaged or foreign.
         """
-        return reader.read_manifests(self.place, (part.shard for part in self.parts(plan_key)))
+        return reader.read_manifests(self.backend, (part.shard for part in self.parts(plan_key)))
 
     def jobs(self, plan_key: str | None = None) -> list[Job]:
         """The jobs (of one plan) whose shards are committed, by name; their ranges may overlap.
 
         No manifest is read: of a million shards that would take a quarter of an hour, and their names take seconds.
         """
-        jobs = reader.committed_jobs(self.place, plan_key)
-        if not self.place.exists(STORE_FILE):
+        jobs = reader.committed_jobs(self.backend, plan_key)
+        if not self.backend.exists(STORE_FILE):
             raise UnreadableError(f"{self.where}: vanished while it was read; is its disk still there?")
         return jobs
 
     def manifest(self, job: Job) -> ShardManifest:
         """The manifest of a job's committed shard; raises as `committed` does."""
-        return reader.read_manifest(reader.shard_folder(self.place, job.shard_id))
+        return reader.read_manifest(reader.shard_folder(self.backend, job.shard_id))
 
     def parts(self, plan_key: str | None = None) -> list[Part]:
         """What counts of which shard, in order of plan and rollout; by the shards' names alone."""
@@ -220,14 +220,14 @@ class Store:
         Raises:
             StoreError: a file is damaged or foreign.
         """
-        shard = reader.shard_folder(self.place, part.shard.shard_id)
+        shard = reader.shard_folder(self.backend, part.shard.shard_id)
         manifest = reader.read_manifest(shard)
         rollouts = reader.read_rollout_table(shard, manifest)
         return part.of(rollouts), part.of(reader.read_interactions(shard, manifest))
 
     def holds(self, job: Job) -> bool:
         """Whether the shard of a job is committed."""
-        return reader.is_committed(reader.shard_folder(self.place, job.shard_id))
+        return reader.is_committed(reader.shard_folder(self.backend, job.shard_id))
 
     def commit(
         self,
@@ -271,7 +271,7 @@ class Store:
                     f"{job.shard_id}: rollout {rollout.index} has other hidden parameters than the store's"
                 )
         points = self.setting.collection.camera.points
-        return commit_shard(self.place, job, rollouts, points, provenance, quarantined, vetted=vetted)
+        return commit_shard(self.backend, job, rollouts, points, provenance, quarantined, vetted=vetted)
 
     def only_driver(self, *, alone: bool = False) -> AbstractContextManager[Any]:
         """Hold the store against other drivers, which would do everything twice.
@@ -283,17 +283,17 @@ class Store:
         Raises:
             UsageError: another driver, or a repair, holds it; the message names the process.
         """
-        return self.place.only_one(DRIVER, alone=alone)
+        return self.backend.only_one(DRIVER, alone=alone)
 
     def sweep(self) -> int:
         """Remove what dead writers left unfinished; returns how many files and folders that was."""
         folders = ["", PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER]
-        return self.place.sweep(folders) + self.underway.sweep()
+        return self.backend.sweep(folders) + self.crash_log.sweep()
 
     def digest(self, plan_key: str | None = None) -> str:
         """Content digest of the store, or of one plan: independent of shards, workers, hosts and times."""
         parts = self.parts(plan_key)
-        manifests = reader.read_manifests(self.place, (part.shard for part in parts))
+        manifests = reader.read_manifests(self.backend, (part.shard for part in parts))
         return combined_digest(
             (manifest.plan_key, index, manifest.digests[index - manifest.start])
             for part, manifest in zip(parts, manifests, strict=True)
@@ -341,7 +341,7 @@ class Store:
     ) -> Iterator[tuple[Part, ShardManifest, Any]]:
         """What counts of each shard, its manifest, and one of its tables (see `reader.read_tables`), in order."""
         parts = (part for part in self.parts() if plan_keys is None or part.shard.plan_key in plan_keys)
-        return reader.read_tables(self.place, parts, file, names)
+        return reader.read_tables(self.backend, parts, file, names)
 
     def read_observations(self, shard_id: str) -> ObservationArrays:
         """All clouds of a shard.
@@ -363,15 +363,15 @@ class Store:
 
     def publish_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """Put a policy's files into the store, all or none; see `shared.store.policies`."""
-        policies.publish_policy(self.place, version, files)
+        policies.publish_policy(self.backend, version, files)
 
     def read_policy(self, version: int) -> dict[str, bytes]:
         """A policy's files, checked; see `shared.store.policies`."""
-        return policies.read_policy(self.place, version)
+        return policies.read_policy(self.backend, version)
 
     def policy_versions(self) -> tuple[int, ...]:
         """The versions that are published, in order."""
-        return policies.policy_versions(self.place)
+        return policies.policy_versions(self.backend)
 
     @property
     def path(self) -> Path:
@@ -392,12 +392,12 @@ class Store:
         return self.path / SHARDS_FOLDER
 
     @property
-    def underway(self) -> Underway:
-        """Where workers leave their breadcrumbs."""
-        return Underway(None, self.where) if is_url(self.where) else Underway(self.path / UNDERWAY_FOLDER)
+    def crash_log(self) -> CrashLog:
+        """Where workers leave their heartbeats."""
+        return CrashLog(None, self.where) if is_url(self.where) else CrashLog(self.path / CRASH_LOG_FOLDER)
 
     def _committed_shard(self, shard_id: str) -> Folder:
-        folder = reader.shard_folder(self.place, shard_id)
+        folder = reader.shard_folder(self.backend, shard_id)
         if parse_shard_id(shard_id) is None or not reader.is_committed(folder):
             raise StoreError(f"{self.where}: holds no committed shard {shard_id[:80]!r}; see `store info`")
         return folder
@@ -409,12 +409,12 @@ def _defaults(column: str) -> list[float]:
     return [each.default for each in found if each is not None and each.default is not None]
 
 
-def _refuse_foreign(place: Place) -> None:
+def _refuse_foreign(backend: StorageBackend) -> None:
     """Refuse a folder that holds anything but what another process, creating at this moment, may have put there."""
-    for name in place.names(""):
+    for name in backend.names(""):
         # The other process may have finished since, and its first shard may be there.
-        if not name.startswith((TEMPORARY_PREFIX, LOCK_PREFIX)) and not place.exists(STORE_FILE):
-            raise StoreError(f"{place.where}: is not empty and no store (it holds {name!r}); name an empty folder")
+        if not name.startswith((TEMPORARY_PREFIX, LOCK_PREFIX)) and not backend.exists(STORE_FILE):
+            raise StoreError(f"{backend.where}: is not empty and no store (it holds {name!r}); name an empty folder")
 
 
 def _one_table(schema: Any, found: Iterable[tuple[Part, ShardManifest, Any]]) -> Any:

@@ -10,9 +10,9 @@ from shared.io.redaction import without_places
 from shared.plan import Job
 from shared.records import RolloutRecord
 from shared.reproduction import OBJECTS, STORE, reproduction
-from shared.store.backends.base import Folder, Place, Publication
+from shared.store.backends.base import Folder, StorageBackend, Transaction
 from shared.store.codecs import observations
-from shared.store.codecs.checksummed import seal
+from shared.store.codecs.checksummed import with_checksum
 from shared.store.codecs.columns import InteractionRow, RolloutRow, interaction_columns, rollout_columns
 from shared.store.codecs.digest import rollout_digest
 from shared.store.codecs.tables import table_bytes
@@ -49,7 +49,7 @@ class Unknown:
 
 
 def commit_shard(
-    place: Place,
+    backend: StorageBackend,
     job: Job,
     rollouts: Sequence[RolloutRecord],
     points: int,
@@ -62,7 +62,7 @@ def commit_shard(
     """Write a shard and commit it; where another worker was faster, its shard stays and its manifest is returned.
 
     Args:
-        place: of the store.
+        backend: of the store.
         job: the rollouts that the shard holds.
         rollouts: in order.
         points: N, of every cloud.
@@ -74,7 +74,7 @@ def commit_shard(
     Raises:
         StoreError: a rollout breaks the rules of a record, or the job overlaps another shard of its plan.
     """
-    shard = shard_folder(place, job.shard_id)
+    shard = shard_folder(backend, job.shard_id)
     if is_committed(shard):
         return read_manifest(shard)
     check_rollouts(rollouts, job, points, job.shard_id)
@@ -97,36 +97,36 @@ def commit_shard(
         quarantined=tuple(quarantined),
     )
     described = manifest.as_document() | dict(unknown.fields)
-    _publish(place, parse_manifest(seal(described), str(shard)), files, vetted=vetted)
+    _publish(backend, parse_manifest(with_checksum(described), str(shard)), files, vetted=vetted)
     return read_manifest(shard)
 
 
-def copy_shard(source: Folder, manifest: ShardManifest, place: Place) -> None:
+def copy_shard(source: Folder, manifest: ShardManifest, backend: StorageBackend) -> None:
     """Commit a shard of another place: its files to the last byte, and its manifest, also what is unknown of it.
 
     Args:
         source: the shard.
         manifest: its manifest.
-        place: of the store that it is copied into; known to hold none of its rollouts, unless in a shard of this name.
+        backend: of the store that it is copied into; known to hold none of its rollouts, unless in a shard of this name.
 
     Raises:
         StoreError: the shard is damaged.
     """
-    if is_committed(shard_folder(place, manifest.shard_id)):
+    if is_committed(shard_folder(backend, manifest.shard_id)):
         return
     _check_digests(source, manifest)
-    _publish(place, manifest, read_files(source, manifest), vetted=True)
+    _publish(backend, manifest, read_files(source, manifest), vetted=True)
 
 
-def commit_files(place: Place, manifest: ShardManifest, files: Mapping[str, bytes]) -> None:
+def commit_files(backend: StorageBackend, manifest: ShardManifest, files: Mapping[str, bytes]) -> None:
     """Commit a shard whose files are encoded already; the manifest's entries for them are made here.
 
     Raises:
         StoreError: what was committed cannot be read, or holds other rollouts than the manifest says.
     """
     whole = manifest.model_copy(update={"files": _entries(files)})
-    _publish(place, whole, files, vetted=True)
-    _check_digests(shard_folder(place, whole.shard_id), whole)
+    _publish(backend, whole, files, vetted=True)
+    _check_digests(shard_folder(backend, whole.shard_id), whole)
 
 
 def _check_digests(shard: Folder, manifest: ShardManifest) -> None:
@@ -134,22 +134,22 @@ def _check_digests(shard: Folder, manifest: ShardManifest) -> None:
         raise StoreError(f"{shard}: its rollouts are not those of its manifest; run `adaafford store verify`")
 
 
-def _publish(place: Place, manifest: ShardManifest, files: Mapping[str, bytes], *, vetted: bool) -> None:
+def _publish(backend: StorageBackend, manifest: ShardManifest, files: Mapping[str, bytes], *, vetted: bool) -> None:
     manifest = _without_places(manifest)
-    shard = shard_folder(place, manifest.shard_id)
+    shard = shard_folder(backend, manifest.shard_id)
 
-    def admit() -> None:
+    def check() -> None:
         if not vetted:
-            _refuse_overlap(place, manifest.job)
+            _refuse_overlap(backend, manifest.job)
 
     def describe(held: Mapping[str, bytes]) -> bytes:
         described = manifest
         if held != files:
             described = manifest.model_copy(update={"files": _entries(held)})
             _check_taken_over(shard, described)
-        return seal(described.as_document())
+        return with_checksum(described.as_document())
 
-    place.publish(Publication(shard.key, files, MANIFEST_FILE, describe, admit, lock=manifest.plan_key))
+    backend.publish(Transaction(shard.key, files, MANIFEST_FILE, describe, check, lock=manifest.plan_key))
 
 
 def _without_places(manifest: ShardManifest) -> ShardManifest:
@@ -199,15 +199,15 @@ def _check_taken_over(shard: Folder, manifest: ShardManifest) -> None:
         raise StoreError(f"{shard}: files of another attempt lie here, of other content; run `adaafford store repair`")
 
 
-def _refuse_overlap(place: Place, job: Job) -> None:
+def _refuse_overlap(backend: StorageBackend, job: Job) -> None:
     # No shard holds more than MAX_ROWS rollouts, so none that begins earlier reaches the job. From 10^8 rollouts on the
     # order of names is not that of numbers, and an overlap may be left for `verify` to find.
     first = Job(job.plan_key, max(job.start - MAX_ROWS, 0), job.stop).shard_id
-    for name in place.names_from(SHARDS_FOLDER, first[: first.rindex("-")]):
+    for name in backend.names_from(SHARDS_FOLDER, first[: first.rindex("-")]):
         other = parse_shard_id(name)
         if other is None or other == job:
             continue
         if other.plan_key != job.plan_key or other.start >= job.stop:
             return
-        if job.start < other.stop and is_committed(shard_folder(place, name)):
+        if job.start < other.stop and is_committed(shard_folder(backend, name)):
             raise StoreError(f"{job.shard_id}: overlaps the committed shard {name}; plan only missing rollouts")

@@ -165,7 +165,7 @@ def test_what_is_not_a_number_becomes_null_and_an_unwritable_folder_is_named(tmp
 
 
 @pytest.mark.slow
-def test_a_fleet_makes_what_one_worker_makes(objects: Path) -> None:
+def test_a_worker_group_makes_what_one_worker_makes(objects: Path) -> None:
     flags = ["--rollouts", "2", "--repeats", "1", "--collection.rollout.interactions", "2"]
     script = (
         "from cluster.cli.main import main; main()"  # In a process of its own: Ray wants to be imported before SAPIEN.

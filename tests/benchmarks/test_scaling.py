@@ -62,8 +62,8 @@ def test_noise_that_makes_the_large_look_cheap_is_not_believed() -> None:
 
 def test_actors_with_a_process_lift_the_prediction() -> None:
     stores = [StorePoint(10, 0.1, 0.0, None, 1.0, 1.0)]
-    fleets = [point(10, 1.0), point(110, 2.0), dataclasses.replace(point(60, 2.5), kind="process")]
-    assert predictions(fleets, stores, WISH)["driver_ms_by_job_s"]["at_zero"] == pytest.approx(0.9 + 1.0)
+    worker_groups = [point(10, 1.0), point(110, 2.0), dataclasses.replace(point(60, 2.5), kind="process")]
+    assert predictions(worker_groups, stores, WISH)["driver_ms_by_job_s"]["at_zero"] == pytest.approx(0.9 + 1.0)
 
 
 def test_a_made_up_store_is_listed_as_a_real_one_and_takes_further_shards(template: Store, tmp_path: Path) -> None:
@@ -78,13 +78,13 @@ def test_a_made_up_store_is_listed_as_a_real_one_and_takes_further_shards(templa
     assert len(store.read_rollouts(store.jobs()[-1].shard_id)) == 4
 
 
-def test_a_sleeper_leaves_breadcrumbs_and_a_receipt_of_all_its_rollouts() -> None:
-    crumbs: list[int | None] = []
-    receipt = Sleeper(0.01).run(PLAN, Job(PLAN.key, 3, 6), {}, crumbs.append)
-    assert crumbs == [3, 4, 5, None]
-    assert (receipt.rollouts, receipt.interactions) == (3, 96)
-    assert sum(receipt.outcomes.values()) == 96
-    assert receipt.seconds["total"] >= 0.01
+def test_a_sleeper_leaves_breadcrumbs_and_a_job_result_of_all_its_rollouts() -> None:
+    heartbeats: list[int | None] = []
+    job_result = Sleeper(0.01).run(PLAN, Job(PLAN.key, 3, 6), {}, heartbeats.append)
+    assert heartbeats == [3, 4, 5, None]
+    assert (job_result.rollouts, job_result.interactions) == (3, 96)
+    assert sum(job_result.outcomes.values()) == 96
+    assert job_result.seconds["total"] >= 0.01
 
 
 def test_guests_of_one_process_sleep_at_the_same_time_and_each_does_its_jobs_in_turn(

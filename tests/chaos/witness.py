@@ -4,7 +4,7 @@ import hashlib
 from collections import Counter
 
 from shared.store import Store, verify
-from shared.store.backends.base import place_of
+from shared.store.backends.base import backend_of
 from shared.store.layout import MANIFEST_FILE, MAX_DOCUMENT_BYTES, SHARDS_FOLDER, STORE_FILE
 
 
@@ -26,7 +26,7 @@ class Witness:
         Raises:
             AssertionError: a promise is broken.
         """
-        place = place_of(self._where)
+        place = backend_of(self._where)
         if not (place.is_there() and place.exists(STORE_FILE)):
             assert not self._manifests, "the store itself is gone"
             return 0
@@ -50,7 +50,7 @@ class Witness:
 
 
 def _digest(store: Store, shard_id: str) -> str:
-    manifest = store.place.read(f"{SHARDS_FOLDER}/{shard_id}/{MANIFEST_FILE}", MAX_DOCUMENT_BYTES)
+    manifest = store.backend.read(f"{SHARDS_FOLDER}/{shard_id}/{MANIFEST_FILE}", MAX_DOCUMENT_BYTES)
     return hashlib.sha256(manifest).hexdigest()
 
 

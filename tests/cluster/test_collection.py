@@ -13,15 +13,15 @@ from cluster.collection.driver import collect
 from cluster.collection.tally import CollectionProgress
 from cluster.config.campaign_config import CampaignConfig
 from cluster.workers.session import Crew
-from cluster.workers.worker_group import Fleet, SerialFleet
-from collector.job_result import Receipt, WorkerFactory
+from cluster.workers.worker_group import SerialWorkerGroup, WorkerGroup
+from collector.job_result import JobResult, WorkerFactory
 from collector.watchdog import UnderWay
 from shared.errors import StoreError, UsageError, WorkerError
 from shared.io.files import DRIVER_LOCK, exclusive_lock
 from shared.plan import Job, Plan
 from shared.progress import LINE_EVERY_S
 from shared.store import Store, verify
-from shared.store.crash_log import Underway
+from shared.store.crash_log import CrashLog
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
 
 OBJECTS = Path("objects")
@@ -36,13 +36,13 @@ class FabricatingWorker:
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None: ...
 
-    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> Receipt:
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> JobResult:
         if self.breaks_at is not None and job.start <= self.breaks_at < job.stop:
             raise RuntimeError("no luck")
         records = [fabricate_rollout(plan, index) for index in range(job.start, job.stop)]
         self.store.commit(plan, job, records, {})
         count = sum(len(record.interactions) for record in records)
-        return Receipt(job.shard_id, len(records), count, 0, {"ok": count}, {"total": 0.5})
+        return JobResult(job.shard_id, len(records), count, 0, {"ok": count}, {"total": 0.5})
 
 
 @pytest.fixture
@@ -53,8 +53,8 @@ def store(tmp_path: Path) -> Store:
 def fill(store: Store, rollouts: int, per_shard: int = 2, breaks_at: int | None = None, version: int = 0) -> int:
     """How many rollouts this attempt made."""
     plan = Plan(setting=store.setting, proposer="aip" if version else "random", policy_version=version)
-    fleet = SerialFleet(lambda: FabricatingWorker(store.path, breaks_at))
-    return collect(store, plan, rollouts, per_shard, lambda: fleet, OBJECTS).tally.rollouts
+    worker_group = SerialWorkerGroup(lambda: FabricatingWorker(store.path, breaks_at))
+    return collect(store, plan, rollouts, per_shard, lambda: worker_group, OBJECTS).tally.rollouts
 
 
 def test_the_same_again_does_nothing_and_more_does_the_rest(store: Store) -> None:
@@ -114,7 +114,7 @@ def test_progress_says_what_is_done_and_left_in_plain_lines(capsys: pytest.Captu
     with CollectionProgress("collecting", 4, 10, "STORE", lambda: now) as progress:
         for _ in range(3):
             now += LINE_EVERY_S
-            progress(Receipt("s", 2, 20, 5, {"ok": 20}, {}))
+            progress(JobResult("s", 2, 20, 5, {"ok": 20}, {}))
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "collecting: 4 of 10 rollouts are there, 6 left; into STORE"
     assert lines[1] == "collecting: 6/10 rollouts, 4 interactions/s, 25.0% successful, 0:10 min left"
@@ -130,24 +130,24 @@ class FakeFleet:
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None: ...
 
-    def run(self, plan: Plan, jobs: Sequence[Job], on_receipt: Callable[[Receipt], None]) -> None: ...
+    def run(self, plan: Plan, jobs: Sequence[Job], on_result: Callable[[JobResult], None]) -> None: ...
 
     def close(self) -> None:
         self.closed = True
 
 
-def test_the_same_live_fleet_serves_all_rounds_of_a_store(tmp_path: Path) -> None:
+def test_the_same_live_worker_group_serves_all_rounds_of_a_store(tmp_path: Path) -> None:
     one, other = (Store.create(tmp_path / name, fabricate_setting()) for name in "ab")
     made: list[FakeFleet] = []
 
-    def make(factory: WorkerFactory, underway: Underway) -> Fleet:
+    def make(factory: WorkerFactory, crash_log: CrashLog) -> WorkerGroup:
         made.append(FakeFleet())
         return made[-1]
 
     crew = Crew(make)
     assert crew.for_store(one, OBJECTS) is crew.for_store(one, OBJECTS)
     crew.for_store(other, OBJECTS)
-    assert [fleet.closed for fleet in made] == [True, False]
+    assert [worker_group.closed for worker_group in made] == [True, False]
 
 
 @pytest.mark.parametrize("alternations", [0, 1, 2])
@@ -203,9 +203,9 @@ def adaafford(folder: Path, command: str, run: Path, workers: str) -> "subproces
 def wait_for_stage(run: Path, name: str) -> None:
     import time
 
-    from cluster.runs.run_log import Ledger
+    from cluster.runs.run_log import RunLog
 
     deadline = time.monotonic() + 200
-    while name not in Ledger(run / "log.jsonl").seconds:
+    while name not in RunLog(run / "log.jsonl").seconds:
         assert time.monotonic() < deadline
         time.sleep(0.2)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from cluster.cli.main import run as adaafford
 from cluster.config.evaluation_settings import EvaluateSettings
 from cluster.evaluation.evaluate import PROPOSER, Evaluation
-from cluster.evaluation.policy_evaluation import judge
+from cluster.evaluation.policy_evaluation import evaluate_policy
 from cluster.evaluation.run_evaluation import evaluate_run
 from cluster.evaluation.tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
 from cluster.workers.retries import JobError
@@ -133,7 +133,7 @@ def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) 
     evaluation.add_plan(Plan(setting=evaluation.setting, proposer=PROPOSER, policy_version=7))
     wanted = Evaluation(evaluation, store, 1, 2, 1, finished / "objects", tmp_path, tmp_path)
     with pytest.raises(UsageError, match="trials of another policy"):
-        wanted.execute(Crew(lambda *_: pytest.fail("a fleet was asked for")), print)
+        wanted.execute(Crew(lambda *_: pytest.fail("a worker group was asked for")), print)
 
 
 def row_of(method: str, budget: int, f_score: float) -> EvaluationRow:
@@ -153,7 +153,7 @@ def test_where2act_stands_at_every_budget_and_the_oracle_closes_the_gap(
     no_gap = [*rows[::2], row_of("oracle", 0, 0.1)]
     for known, closed in ((rows, {0.0, 1.0, 0.8}), (rows[::2], {None}), (no_gap, {None})):
         monkeypatch.setattr("cluster.evaluation.policy_evaluation.evaluate_store", lambda *_, known=known: known)
-        table = judge(evaluation, 1, tmp_path / "no-oracle")
+        table = evaluate_policy(evaluation, 1, tmp_path / "no-oracle")
         assert [row["budget"] for row in table.rows if row["method"] == "where2act"] == [1, 4]
         assert {row["gap_closed"] and round(row["gap_closed"], 9) for row in table.rows} == closed
 
@@ -214,7 +214,7 @@ def test_a_stopped_evaluation_ends_in_the_same_table(
     begun = Store.open(stopped / "store")
     assert len(begun.committed()) == 1
     # One trial of one object; the other has had none.
-    assert judge(begun, 1, tmp_path / "no-oracle").objects == 1
+    assert evaluate_policy(begun, 1, tmp_path / "no-oracle").objects == 1
     assert not (stopped / RESULTS_FILE).exists()
     evaluate_run(finished, FAST, stopped)
     for name in (RESULTS_FILE, CSV_FILE, MARKDOWN_FILE):

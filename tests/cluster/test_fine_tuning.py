@@ -13,7 +13,7 @@ from cluster.config.campaign_config import CampaignConfig
 from cluster.config.evaluation_settings import EvaluateSettings
 from cluster.evaluation.run_evaluation import evaluate_run
 from cluster.runs.run_folder import RunFolder
-from cluster.runs.warm_start import adopt, seen_by
+from cluster.runs.warm_start import seen_by, warm_start
 from collector.objects.catalogue import scan
 from collector.objects.procedural import generate
 from learner.stages.jobs import read_policy_folder
@@ -39,7 +39,7 @@ def test_the_stages_begin_with_what_is_adopted() -> None:
 
 
 def test_what_is_adopted_remembers_what_it_has_seen(source: RunFolder, tmp_path: Path) -> None:
-    adopt(str(source.path), "push-faucet", tmp_path)
+    warm_start(str(source.path), "push-faucet", tmp_path)
     seen = set(json.loads((tmp_path / "done.json").read_text())["objects"])
     assert seen == {ref.content_hash for ref in source.objects_used().train} == seen_by(str(source.path))
     assert read_policy_folder(tmp_path).trained >= {"prior", "aap", "aip"}
@@ -73,7 +73,7 @@ def test_a_run_that_started_from_a_policy_is_not_evaluated_on_what_that_has_seen
     source: RunFolder, tmp_path: Path
 ) -> None:
     made = make_finished_run(tmp_path / "run", objects=2)  # Of the same objects, and trained on fewer.
-    adopt(str(source.path), "push-faucet", made.adopted)
+    warm_start(str(source.path), "push-faucet", made.adopted)
     used = made.objects_used()
     own = {ref.content_hash for ref in used.train}
     assert seen_by(str(made.path)) == own | seen_by(str(source.path)) > own

@@ -15,10 +15,10 @@ from cluster.cli.commands.collect import CollectCommand
 from cluster.cli.main import run
 from cluster.collection.driver import Newest, collect
 from cluster.collection.status_writer import read_status
-from cluster.workers.job_queue import Series
-from cluster.workers.policy_source import LOOK_S, PlanInForce
-from cluster.workers.worker_group import SerialFleet
-from collector.job_result import Receipt
+from cluster.workers.job_queue import RolloutQueue
+from cluster.workers.policy_source import LOOK_S, PolicySource
+from cluster.workers.worker_group import SerialWorkerGroup
+from collector.job_result import JobResult
 from collector.watchdog import UnderWay
 from shared.errors import WorkerError
 from shared.plan import Job, Plan, missing_ranges
@@ -53,7 +53,7 @@ class LearningWorker:
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         assert files["weights.safetensors"] == b"weights %d" % version
 
-    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> Receipt:
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> JobResult:
         if self.shards == self.breaks_at:
             raise RuntimeError("killed")
         records = [fabricate_rollout(plan, index) for index in range(job.start, job.stop)]
@@ -61,12 +61,12 @@ class LearningWorker:
         self.shards += 1
         if self.shards in self.publishes:
             publish(self.store, self.publishes[self.shards])
-        return Receipt(job.shard_id, len(records), 0, 0, {}, {"total": 0.5})
+        return JobResult(job.shard_id, len(records), 0, 0, {}, {"total": 0.5})
 
 
 def fill(store: Store, rollouts: int, plan: Newest, publishes: Mapping[int, int], breaks_at: int | None = None) -> None:
     worker = LearningWorker(store, publishes, breaks_at)
-    collect(store, plan, rollouts, PER_SHARD, lambda: SerialFleet(lambda: worker), OBJECTS)
+    collect(store, plan, rollouts, PER_SHARD, lambda: SerialWorkerGroup(lambda: worker), OBJECTS)
 
 
 def held(store: Store) -> dict[int, list[int]]:
@@ -132,7 +132,7 @@ def test_rounds_are_the_same_whenever_they_are_stopped(store: Store, tmp_path: P
 
 def test_the_first_policy_is_waited_for(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     def publish_when_waited_for() -> None:
-        while (status := read_status(store.place)) is None or status.state != "waiting":
+        while (status := read_status(store.backend)) is None or status.state != "waiting":
             time.sleep(0.02)
         publish(store, 1)
 
@@ -155,7 +155,7 @@ def test_each_number_is_handed_out_once_in_jobs_of_one_plan(
 ) -> None:
     first = (version for version, times in enumerate(switches, 1) for _ in range(times))
     versions = itertools.chain(first, itertools.count(len(switches) + 1))
-    series = Series(lambda: plan_of(next(versions)), missing_ranges(40, done), per_shard, per_plan)
+    series = RolloutQueue(lambda: plan_of(next(versions)), missing_ranges(40, done), per_shard, per_plan)
     orders = []
     while not series.ended:
         order = series.take()
@@ -173,7 +173,7 @@ def test_each_number_is_handed_out_once_in_jobs_of_one_plan(
 def test_a_successor_is_in_force_within_the_bound_and_versions_never_go_back(store: Store) -> None:
     now = 0.0
     adopted: list[int] = []
-    in_force = PlanInForce(store, "aip", None, lambda plan: adopted.append(plan.policy_version), lambda: now)
+    in_force = PolicySource(store, "aip", None, lambda plan: adopted.append(plan.policy_version), lambda: now)
     assert in_force() is None
     publish(store, 2)
     publish(store, 1)
@@ -191,14 +191,14 @@ def test_the_driver_writes_down_how_it_stands(store: Store) -> None:
     publish(store, 1)
     with pytest.raises(WorkerError):
         fill(store, 8, Newest(), {}, breaks_at=2)
-    status = read_status(store.place)
+    status = read_status(store.backend)
     assert status is not None
     assert (status.state, status.title, status.policy) == ("stopped", "aip-latest", 1)
     assert (status.done, status.total, status.left) == (4, 8, 4)
     assert status.restarts == 3
     assert not status.is_alive(status.written)
     fill(store, 8, Newest(), {})
-    status = read_status(store.place)
+    status = read_status(store.backend)
     assert status is not None and (status.state, status.done, status.rollouts) == ("done", 8, 4)
     assert verify(store) == []
 

@@ -1,4 +1,4 @@
-"""Metrics count what receipts say, under labels that are few whatever is collected."""
+"""Metrics count what job results say, under labels that are few whatever is collected."""
 
 from collections import Counter as Tally
 from typing import Any
@@ -8,7 +8,7 @@ from ray.util.metrics import Gauge, Metric
 
 from cluster.workers import metrics
 from cluster.workers.metrics import FleetMetrics
-from collector.job_result import Receipt
+from collector.job_result import JobResult
 from shared.plan import Plan
 from shared.types import OutcomeKind
 from tests.support.fabricate import fabricate_setting
@@ -34,7 +34,7 @@ def values(monkeypatch: pytest.MonkeyPatch) -> Tally[tuple[str, ...]]:
     return found
 
 
-def receipt(**over: Any) -> Receipt:
+def job_result(**over: Any) -> JobResult:
     given: dict[str, Any] = {
         "shard_id": "aip-v3-00000000-00000004",
         "rollouts": 4,
@@ -43,15 +43,15 @@ def receipt(**over: Any) -> Receipt:
         "outcomes": {OutcomeKind.OK.value: 30, OutcomeKind.NO_CONTACT.value: 2},
         "seconds": {"simulate": 1.5, "total": 2.0, "write": 0.0},
     }
-    return Receipt(**given | over)
+    return JobResult(**given | over)
 
 
-def test_receipts_add_up(values: Tally[tuple[str, ...]]) -> None:
-    fleet = FleetMetrics(workers=7)
+def test_job_results_add_up(values: Tally[tuple[str, ...]]) -> None:
+    worker_group = FleetMetrics(workers=7)
     for _ in range(3):
-        fleet.add(PLAN, receipt())
-    fleet.add(PLAN, receipt(successes=0, quarantined=1, outcomes={"ok": 0}))
-    fleet.replaced("loss")
+        worker_group.add(PLAN, job_result())
+    worker_group.add(PLAN, job_result(successes=0, quarantined=1, outcomes={"ok": 0}))
+    worker_group.replaced("loss")
     assert values == {
         ("adaafford_workers",): 7,
         ("adaafford_policy", "push", "aip"): 3,
@@ -67,10 +67,10 @@ def test_receipts_add_up(values: Tally[tuple[str, ...]]) -> None:
 
 
 def test_what_is_told_does_not_grow_with_what_is_collected(values: Tally[tuple[str, ...]]) -> None:
-    fleet = FleetMetrics(workers=2)
-    fleet.add(PLAN, receipt())
+    worker_group = FleetMetrics(workers=2)
+    worker_group.add(PLAN, job_result())
     series = set(values)
     for number in range(100):
         plan = PLAN.model_copy(update={"policy_version": number})
-        fleet.add(plan, receipt(shard_id=f"aip-v{number}-00000000-00000004"))
+        worker_group.add(plan, job_result(shard_id=f"aip-v{number}-00000000-00000004"))
     assert set(values) == series

@@ -14,9 +14,9 @@ import pytest
 
 from cluster.cli.main import run as adaafford
 from cluster.collection.driver import Collected, collect
-from cluster.workers.retries import MAX_FAULTS, MAX_LOSSES, Blame, Failure, JobError
-from cluster.workers.session import fleets
-from cluster.workers.worker_group import SerialFleet
+from cluster.workers.retries import MAX_FAULTS, MAX_LOSSES, Failure, JobError, RetryPolicy
+from cluster.workers.session import worker_groups
+from cluster.workers.worker_group import SerialWorkerGroup
 from collector.watchdog import Limits
 from learner.data.dataset import load_dataset
 from shared.errors import StoreError, WorkerError
@@ -24,7 +24,7 @@ from shared.io.files import process_name
 from shared.plan import Job, Plan
 from shared.records import RolloutStatus
 from shared.store import Quarantined, Store, compact, verify
-from shared.store.crash_log import Crumb, Underway, summary_of
+from shared.store.crash_log import CrashLog, Heartbeat, summary_of
 from shared.store.maintenance import reopening
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
 from tests.support.misbehaving_worker import MisbehavingWorker
@@ -44,9 +44,9 @@ def new_store(path: Path) -> Store:
 def fill(
     store: Store, mishaps: Mapping[int, str], per_shard: int = PER_SHARD, *, retry_quarantined: bool = False
 ) -> Collected:
-    fleet = SerialFleet(partial(MisbehavingWorker, store.path, mishaps))
+    worker_group = SerialWorkerGroup(partial(MisbehavingWorker, store.path, mishaps))
     plan = Plan(setting=store.setting)
-    return collect(store, plan, ROLLOUTS, per_shard, lambda: fleet, OBJECTS, retry_quarantined=retry_quarantined)
+    return collect(store, plan, ROLLOUTS, per_shard, lambda: worker_group, OBJECTS, retry_quarantined=retry_quarantined)
 
 
 def rollout_digests(store: Store) -> dict[int, str]:
@@ -63,7 +63,7 @@ def assert_only_these_are_missing(disturbed: Store, undisturbed: Store, culprits
     assert not culprits & set(disturbed.interactions(["rollout"]).column("rollout").to_pylist())
     assert {each.rollout for shard in disturbed.committed() for each in shard.quarantined} == culprits
     assert verify(disturbed) == []
-    assert list(disturbed.underway.folder.glob("*")) == []
+    assert list(disturbed.crash_log.folder.glob("*")) == []
 
 
 def test_a_rollout_that_always_raises_is_given_up_and_nothing_else(tmp_path: Path) -> None:
@@ -105,9 +105,9 @@ def test_an_environment_that_breaks_after_a_while_ends_the_collection(tmp_path: 
 @pytest.mark.parametrize("per_shard", [1, 4])
 def test_a_single_rollout_that_fails_in_a_new_store_is_not_quarantined(tmp_path: Path, per_shard: int) -> None:
     store = new_store(tmp_path)
-    fleet = SerialFleet(partial(MisbehavingWorker, store.path, {0: "raise"}))
+    worker_group = SerialWorkerGroup(partial(MisbehavingWorker, store.path, {0: "raise"}))
     with pytest.raises(WorkerError, match="no rollout succeeded, and rollout 0 failed again and again: RuntimeError"):
-        collect(store, Plan(setting=store.setting), 1, per_shard, lambda: fleet, OBJECTS)
+        collect(store, Plan(setting=store.setting), 1, per_shard, lambda: worker_group, OBJECTS)
     assert store.jobs() == []
 
 
@@ -122,9 +122,9 @@ def test_the_first_rollout_is_quarantined_once_others_succeed(tmp_path: Path, pe
 def test_the_last_rollout_of_a_store_is_quarantined_although_it_is_alone(tmp_path: Path) -> None:
     store = new_store(tmp_path)
     fill(store, {})
-    fleet = SerialFleet(partial(MisbehavingWorker, store.path, {ROLLOUTS: "raise"}))
+    worker_group = SerialWorkerGroup(partial(MisbehavingWorker, store.path, {ROLLOUTS: "raise"}))
     plan = Plan(setting=store.setting)
-    assert collect(store, plan, ROLLOUTS + 1, PER_SHARD, lambda: fleet, OBJECTS).tally.quarantined == 1
+    assert collect(store, plan, ROLLOUTS + 1, PER_SHARD, lambda: worker_group, OBJECTS).tally.quarantined == 1
 
 
 @pytest.mark.parametrize("compacted", [False, True])
@@ -216,61 +216,61 @@ def test_no_reason_is_given_for_what_was_executed(tmp_path: Path) -> None:
 
 def test_three_faults_or_ten_losses_quarantine_a_rollout() -> None:
     for failure, most in ((FAULT, MAX_FAULTS), (LOSS, MAX_LOSSES)):
-        blame = Blame()
+        retries = RetryPolicy()
         for _ in range(most):
-            assert blame.quarantined(JOB) == {}
-            blame.charge(JOB, failure)
-        assert blame.quarantined(JOB) == {5: f"{failure.reason} ({most} times)"}
-        assert blame.quarantined(Job("random-v0", 8, 12)) == {}
+            assert retries.quarantined(JOB) == {}
+            retries.record_failure(JOB, failure)
+        assert retries.quarantined(JOB) == {5: f"{failure.reason} ({most} times)"}
+        assert retries.quarantined(Job("random-v0", 8, 12)) == {}
 
 
 def test_faults_of_different_rollouts_do_not_add_up() -> None:
-    blame = Blame()
+    retries = RetryPolicy()
     for rollout in range(4, 8):
         for _ in range(MAX_FAULTS - 1):
-            blame.charge(JOB, Failure("crash", rollout, fault=True))
-    assert blame.quarantined(JOB) == {}
+            retries.record_failure(JOB, Failure("crash", rollout, fault=True))
+    assert retries.quarantined(JOB) == {}
 
 
 def test_a_job_that_fails_without_a_rollout_ends_the_run() -> None:
-    blame = Blame()
+    retries = RetryPolicy()
     for _ in range(MAX_FAULTS - 1):
-        blame.charge(JOB, Failure("OSError: no space left", None, fault=True))
+        retries.record_failure(JOB, Failure("OSError: no space left", None, fault=True))
     with pytest.raises(JobError, match=r"^job random-v0-00000004-00000008 failed 3 times; last: OSError"):
-        blame.charge(JOB, Failure("OSError: no space left", None, fault=True))
+        retries.record_failure(JOB, Failure("OSError: no space left", None, fault=True))
 
 
 def test_workers_that_are_lost_as_they_start_end_the_run_only_if_none_ever_lives() -> None:
-    blame = Blame(workers=2)
+    retries = RetryPolicy(workers=2)
     start = Failure("lost", None, fault=False)
     for _ in range(3):
         for _ in range(2 * MAX_LOSSES - 1):
-            blame.charge(JOB, start)
-        blame.acquit(Job("random-v0", 0, 4))
+            retries.record_failure(JOB, start)
+        retries.reset(Job("random-v0", 0, 4))
     with pytest.raises(JobError):
         for _ in range(2 * MAX_LOSSES):
-            blame.charge(JOB, start)
+            retries.record_failure(JOB, start)
 
 
 def test_a_breadcrumb_says_what_its_process_does(tmp_path: Path) -> None:
-    underway = Underway(tmp_path / "underway")
-    assert underway.crumb_of(process_name()) is None
-    underway.leave(Crumb(shard_id=JOB.shard_id, rollout=5))
-    underway.leave(Crumb(shard_id=JOB.shard_id, rollout=6))
-    assert underway.crumb_of(process_name()) == Crumb(shard_id=JOB.shard_id, rollout=6)
-    assert underway.sweep() == 0, "this process is alive"
-    underway.leave(Crumb(shard_id="aip-v1-00000000-00000001", rollout=None))
-    assert underway.crumb_of(process_name()) == Crumb(shard_id="aip-v1-00000000-00000001", rollout=None)
-    underway.forget(process_name())
-    assert underway.crumb_of(process_name()) is None
+    crash_log = CrashLog(tmp_path / "underway")
+    assert crash_log.heartbeat_of(process_name()) is None
+    crash_log.leave(Heartbeat(shard_id=JOB.shard_id, rollout=5))
+    crash_log.leave(Heartbeat(shard_id=JOB.shard_id, rollout=6))
+    assert crash_log.heartbeat_of(process_name()) == Heartbeat(shard_id=JOB.shard_id, rollout=6)
+    assert crash_log.sweep() == 0, "this process is alive"
+    crash_log.leave(Heartbeat(shard_id="aip-v1-00000000-00000001", rollout=None))
+    assert crash_log.heartbeat_of(process_name()) == Heartbeat(shard_id="aip-v1-00000000-00000001", rollout=None)
+    crash_log.forget(process_name())
+    assert crash_log.heartbeat_of(process_name()) is None
 
 
 @pytest.mark.parametrize("damage", [b"", b'{"shard_id"', b"[]", b'{"shard_id":"x","rollout":-1}', b"\xff" * 100_000])
 def test_half_a_breadcrumb_blames_nobody(tmp_path: Path, damage: bytes) -> None:
     (tmp_path / "host~1~1.json").write_bytes(damage)
-    assert Underway(tmp_path).crumb_of("host~1~1") is None
-    assert Underway(tmp_path).crumb_of("host~2~2") is None
-    assert Underway(tmp_path).fault_of("host~1~1") == ""
+    assert CrashLog(tmp_path).heartbeat_of("host~1~1") is None
+    assert CrashLog(tmp_path).heartbeat_of("host~2~2") is None
+    assert CrashLog(tmp_path).fault_of("host~1~1") == ""
 
 
 def test_a_dead_process_leaves_its_last_words_until_they_are_swept(tmp_path: Path) -> None:
@@ -284,16 +284,16 @@ def test_a_dead_process_leaves_its_last_words_until_they_are_swept(tmp_path: Pat
         "with guard.job(Job('random-v0', 4, 8)) as under_way: under_way(5); ctypes.string_at(0)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script, store.underway.folder], capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", script, store.crash_log.folder], capture_output=True, text=True, timeout=60
     )
     process = done.stdout.strip()
-    crumb = store.underway.crumb_of(process)
-    assert crumb is not None
-    assert crumb == Crumb(shard_id=JOB.shard_id, rollout=5, written=crumb.written)
-    assert store.underway.fault_of(process).startswith("Segmentation fault, in string_at (__init__.py:")
+    heartbeat = store.crash_log.heartbeat_of(process)
+    assert heartbeat is not None
+    assert heartbeat == Heartbeat(shard_id=JOB.shard_id, rollout=5, written=heartbeat.written)
+    assert store.crash_log.fault_of(process).startswith("Segmentation fault, in string_at (__init__.py:")
     assert verify(store) == []
     assert store.sweep() == 2
-    assert list(store.underway.folder.iterdir()) == []
+    assert list(store.crash_log.folder.iterdir()) == []
 
 
 def test_last_words_come_to_one_line() -> None:
@@ -315,9 +315,9 @@ def test_crashes_hangs_and_kills_cost_themselves_alone_on_ray(tmp_path: Path) ->
     mishaps = {1: "crash", 6: "hang", 7: "raise", 10: "kill"}
     disturbed, undisturbed = new_store(tmp_path / "disturbed"), new_store(tmp_path / "undisturbed")
     plan = Plan(setting=disturbed.setting)
-    with fleets(2, Limits(rollout_s=2.0)) as make:
-        fleet = make(partial(MisbehavingWorker, disturbed.path, mishaps), disturbed.underway)
-        collect(disturbed, plan, ROLLOUTS, PER_SHARD, lambda: fleet, OBJECTS)
+    with worker_groups(2, Limits(rollout_s=2.0)) as make:
+        worker_group = make(partial(MisbehavingWorker, disturbed.path, mishaps), disturbed.crash_log)
+        collect(disturbed, plan, ROLLOUTS, PER_SHARD, lambda: worker_group, OBJECTS)
     fill(undisturbed, {})
     assert_only_these_are_missing(disturbed, undisturbed, set(mishaps))
     reasons = {each.rollout: each.reason for shard in disturbed.committed() for each in shard.quarantined}
@@ -332,10 +332,12 @@ def test_crashes_hangs_and_kills_cost_themselves_alone_on_ray(tmp_path: Path) ->
 @pytest.mark.parametrize(("mishap", "said"), [("raise", "3 different rollouts failed"), ("library", "failed 3 times")])
 def test_a_broken_environment_ends_the_collection_on_ray(tmp_path: Path, mishap: str, said: str) -> None:
     store = new_store(tmp_path)
-    with fleets(2, Limits()) as make:
-        fleet = make(partial(MisbehavingWorker, store.path, dict.fromkeys(range(ROLLOUTS), mishap)), store.underway)
+    with worker_groups(2, Limits()) as make:
+        worker_group = make(
+            partial(MisbehavingWorker, store.path, dict.fromkeys(range(ROLLOUTS), mishap)), store.crash_log
+        )
         with pytest.raises(WorkerError, match=said):
-            collect(store, Plan(setting=store.setting), ROLLOUTS, 1, lambda: fleet, OBJECTS)
+            collect(store, Plan(setting=store.setting), ROLLOUTS, 1, lambda: worker_group, OBJECTS)
     assert all(not shard.quarantined for shard in store.committed())
 
 
@@ -359,13 +361,13 @@ def test_breadcrumbs_are_found_by_whoever_reaches_the_store(
     kind: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     where = str(tmp_path / "store") if kind == "disk" else request.getfixturevalue("s3_url")
-    Store.create(where, fabricate_setting()).underway.leave(Crumb(shard_id=JOB.shard_id, rollout=5))
-    elsewhere = Store.open(where).underway
+    Store.create(where, fabricate_setting()).crash_log.leave(Heartbeat(shard_id=JOB.shard_id, rollout=5))
+    elsewhere = Store.open(where).crash_log
     if kind == "bucket":
         elsewhere = replace(elsewhere, folder=tmp_path / "of-another-machine")
-    assert elsewhere.crumbs() == {process_name(): Crumb(shard_id=JOB.shard_id, rollout=5)}
-    assert elsewhere.crumb_of(process_name()) == Crumb(shard_id=JOB.shard_id, rollout=5)
+    assert elsewhere.heartbeats() == {process_name(): Heartbeat(shard_id=JOB.shard_id, rollout=5)}
+    assert elsewhere.heartbeat_of(process_name()) == Heartbeat(shard_id=JOB.shard_id, rollout=5)
     assert elsewhere.sweep() == 0, "this process is alive"
     elsewhere.forget(process_name())
-    assert elsewhere.crumbs() == {}
-    assert elsewhere.crumb_of(process_name()) is None
+    assert elsewhere.heartbeats() == {}
+    assert elsewhere.heartbeat_of(process_name()) is None

@@ -50,7 +50,7 @@ from shared.store import Store
 while True:
     try:
         store = Store.open(sys.argv[1])
-        print(json.dumps([len(store.jobs()), list(store.underway.crumbs())]), flush=True)
+        print(json.dumps([len(store.jobs()), list(store.underway.heartbeats())]), flush=True)
     except StoreError:
         pass  # Not made yet.
     time.sleep(1.0)
@@ -120,7 +120,7 @@ class Watcher:
     log: Path
 
     def look(self) -> tuple[int, set[str]]:
-        """How many shards are there, and which processes have left a breadcrumb and are not forgotten."""
+        """How many shards are there, and which processes have left a heartbeat and are not forgotten."""
         lines = [line for line in self.log.read_text().splitlines(keepends=True) if line.endswith("]\n")]
         shards, workers = json.loads(lines[-1]) if lines else (0, [])
         return shards, set(workers)

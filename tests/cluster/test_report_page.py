@@ -20,16 +20,16 @@ from cluster.cli.main import run as run_command
 from cluster.config.campaign_config import CampaignConfig
 from cluster.evaluation.published import published
 from cluster.evaluation.tables import ResultRow
-from cluster.evaluation.trials import Episode, first_episodes, most_telling
+from cluster.evaluation.trials import EvaluationTrial, first_trials, most_telling
 from cluster.reporting.clouds import TANGENT, CloudView, draw_panels, tried
 from cluster.reporting.collecting import wilson
-from cluster.reporting.counterfactuals import Laboratory, hinge_twins, variations
+from cluster.reporting.counterfactuals import Counterfactuals, hinge_twins, variations
 from cluster.reporting.failures import FailedExploit, varied
 from cluster.reporting.page import MAX_TEXT, Drawing, Page, Section, plain, render, shortened
 from cluster.reporting.results import Results, table_of
 from cluster.reporting.training import after_tries, curves_of, read_entries
 from cluster.runs.run_folder import ObjectsUsed, RunFolder, begin
-from cluster.runs.run_log import Ledger
+from cluster.runs.run_log import RunLog
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import StoreError
 from shared.plan import EvaluationConfig, Job, ObjectRef, Plan, Setting
@@ -118,10 +118,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     fill(made.store, Plan(setting=collected), 4).publish_policy(1, policy_of().to_files())
     fill(made.evaluation, Plan(setting=evaluated, proposer="evaluation", policy_version=1), 4)
     write_trainings(made)
-    ledger = Ledger(made.log)
+    run_log = RunLog(made.log)
     tally = {"interactions": 32, "seconds": {"total": 2.0, "simulate": 1.5, ATTACK: 0.5}}
     for stage, result in (("collect-random", {"tally": tally}), (f"train-{ATTACK}", {}), ("evaluate", {})):
-        with ledger.stage(stage) as done:
+        with run_log.stage(stage) as done:
             done(result)
     return made
 
@@ -432,33 +432,31 @@ def test_an_arrow_ends_where_the_gripper_touches() -> None:
 # Episodes and failures
 
 
-def test_an_episode_is_what_one_method_did(run: RunFolder) -> None:
-    found = first_episodes(Store.open(run.evaluation))
+def test_an_trial_is_what_one_method_did(run: RunFolder) -> None:
+    found = first_trials(Store.open(run.evaluation))
     assert len(found) == 4
-    for episode in found:
-        assert [row.step for row in episode.tries] == [4, 6]
-        assert [row.budget for row in episode.exploits] == [1, 2]
-        assert [len(episode.before(row)) for row in episode.exploits] == [1, 2]
-        assert episode.history[0].observation is episode.rollout.observations[episode.tries[0].observation]
+    for trial in found:
+        assert [row.step for row in trial.tries] == [4, 6]
+        assert [row.budget for row in trial.exploits] == [1, 2]
+        assert [len(trial.before(row)) for row in trial.exploits] == [1, 2]
+        assert trial.history[0].observation is trial.rollout.observations[trial.tries[0].observation]
     assert most_telling(found, Adapter(policy_of())) in found
     assert most_telling([], Adapter(policy_of())) is None
-    assert len(first_episodes(Store.open(run.evaluation), 2)) == 2
+    assert len(first_trials(Store.open(run.evaluation), 2)) == 2
 
 
 def test_failures_come_one_of_a_kind_first_and_the_most_believed_before_others(run: RunFolder) -> None:
-    episode = first_episodes(Store.open(run.evaluation))[0]
+    trial = first_trials(Store.open(run.evaluation))[0]
     kinds = [OutcomeKind.NO_GRASP, OutcomeKind.NO_GRASP, OutcomeKind.NO_GRASP, OutcomeKind.OK, OutcomeKind.WRONG_PART]
-    failures = [
-        failure_of(episode, kind, belief) for kind, belief in zip(kinds, (0.9, 0.8, 0.7, 0.1, 0.2), strict=True)
-    ]
+    failures = [failure_of(trial, kind, belief) for kind, belief in zip(kinds, (0.9, 0.8, 0.7, 0.1, 0.2), strict=True)]
     shown = [(failure.row.outcome.kind, failure.belief) for failure in varied(failures)]
     assert shown == [(kinds[0], 0.9), (kinds[4], 0.2), (kinds[3], 0.1), (kinds[1], 0.8)]
 
 
-def failure_of(episode: Episode, kind: OutcomeKind, belief: float) -> FailedExploit:
-    row = episode.exploits[-1]
+def failure_of(trial: EvaluationTrial, kind: OutcomeKind, belief: float) -> FailedExploit:
+    row = trial.exploits[-1]
     outcome = dataclasses.replace(row.outcome, kind=kind, success=False)
-    return FailedExploit(episode, dataclasses.replace(row, outcome=outcome), belief)
+    return FailedExploit(trial, dataclasses.replace(row, outcome=outcome), belief)
 
 
 # Hidden facts
@@ -505,8 +503,8 @@ def test_twins_look_alike_and_are_tried_alike(tmp_path: Path) -> None:
     setting = door_setting()
     twins = hinge_twins(setting, tmp_path)
     policy = Policy.untrained(setting.task, TINY, 0).with_trained("prior").with_trained("aap").with_trained("aip")
-    laboratory = Laboratory(setting, Adapter(policy))
-    left, right = laboratory.posteriors(variations(setting, twins[0], twins)[-1])
+    counterfactuals = Counterfactuals(setting, Adapter(policy))
+    left, right = counterfactuals.posteriors(variations(setting, twins[0], twins)[-1])
     assert (left.label, right.label) == ("hinge on the left", "hinge on the right")
     assert np.array_equal(left.observation.points, right.observation.points)
     for one, other in zip(left.history, right.history, strict=True):

@@ -1,4 +1,4 @@
-"""The ledger and the stages: done once, timed over all attempts, whatever a kill leaves."""
+"""The run log and the stages: done once, timed over all attempts, whatever a kill leaves."""
 
 import tracemalloc
 from collections.abc import Callable, Mapping
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cluster.runs.run_log import BEAT_SHARE, Ledger, pause_s
+from cluster.runs.run_log import BEAT_SHARE, RunLog, pause_s
 from tests.support.waiting import wait_until
 
 
@@ -45,10 +45,10 @@ def test_each_stage_runs_once_however_often_the_run_stops(tmp_path: Path) -> Non
     stages = stage("a", log, clock) | stage("b", log, clock, fails=True) | stage("c", log, clock)
     for _ in range(2):
         with pytest.raises(RuntimeError):
-            Ledger(tmp_path / "log.jsonl", clock).run(stages, said.append)
+            RunLog(tmp_path / "log.jsonl", clock).run(stages, said.append)
     stages |= stage("b", log, clock)
-    Ledger(tmp_path / "log.jsonl", clock).run(stages, said.append)
-    Ledger(tmp_path / "log.jsonl", clock).run(stages, said.append)
+    RunLog(tmp_path / "log.jsonl", clock).run(stages, said.append)
+    RunLog(tmp_path / "log.jsonl", clock).run(stages, said.append)
     assert log == ["a", "b", "b", "b", "c"]
     assert said[-1] == "done before: a, b, c"
 
@@ -56,11 +56,11 @@ def test_each_stage_runs_once_however_often_the_run_stops(tmp_path: Path) -> Non
 def test_wall_time_is_added_up_over_attempts(tmp_path: Path) -> None:
     clock, log = FakeClock(), list[str]()
     with pytest.raises(RuntimeError):
-        Ledger(tmp_path / "log.jsonl", clock).run(stage("b", log, clock, fails=True), log.append)
-    ledger = Ledger(tmp_path / "log.jsonl", clock)
-    ledger.run(stage("b", log, clock), log.append)
-    assert ledger.seconds == {"b": 20.0} == Ledger(tmp_path / "log.jsonl").seconds
-    assert ledger.result("b") == {"made": "b"} == Ledger(tmp_path / "log.jsonl").result("b")
+        RunLog(tmp_path / "log.jsonl", clock).run(stage("b", log, clock, fails=True), log.append)
+    run_log = RunLog(tmp_path / "log.jsonl", clock)
+    run_log.run(stage("b", log, clock), log.append)
+    assert run_log.seconds == {"b": 20.0} == RunLog(tmp_path / "log.jsonl").seconds
+    assert run_log.result("b") == {"made": "b"} == RunLog(tmp_path / "log.jsonl").result("b")
 
 
 @settings(deadline=None)
@@ -68,15 +68,15 @@ def test_wall_time_is_added_up_over_attempts(tmp_path: Path) -> None:
 def test_a_torn_log_loses_at_most_its_last_line(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
     path = tmp_path_factory.mktemp("ledger") / "log.jsonl"
     clock = FakeClock()
-    Ledger(path, clock).run(abc([], clock), lambda line: None)
+    RunLog(path, clock).run(abc([], clock), lambda line: None)
     whole = path.read_bytes()
     path.write_bytes(whole[: min(cut, len(whole))])
-    before = Ledger(path, clock).finished
+    before = RunLog(path, clock).finished
     assert before == tuple("abc")[: len(before)]
     assert len(before) >= path.read_bytes().count(b'"done"') - 1
     log: list[str] = []
-    Ledger(path, clock).run(abc(log, clock), lambda line: None)
-    assert (*before, *log) == ("a", "b", "c") == Ledger(path).finished
+    RunLog(path, clock).run(abc(log, clock), lambda line: None)
+    assert (*before, *log) == ("a", "b", "c") == RunLog(path).finished
 
 
 def test_a_stage_under_way_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,11 +86,11 @@ def test_a_stage_under_way_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     def run() -> Mapping[str, Any]:
         clock.now = 7.0
-        wait_until(lambda: Ledger(path).seconds.get("a") == 7.0)
-        seen.append(Ledger(path).seconds["a"])
+        wait_until(lambda: RunLog(path).seconds.get("a") == 7.0)
+        seen.append(RunLog(path).seconds["a"])
         return {}
 
-    Ledger(path, clock).run({"a": run}, lambda line: None)
+    RunLog(path, clock).run({"a": run}, lambda line: None)
     assert seen == [7.0]
 
 
@@ -105,12 +105,12 @@ def test_a_log_of_months_by_older_software_is_read(tmp_path: Path) -> None:
         file.write(beat % 1_000_000)
         file.write(b'{"time": 2.0, "event": "be')
     tracemalloc.start()
-    ledger = Ledger(path)
+    run_log = RunLog(path)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert ledger.seconds == {"objects": 2.5, "collect-random": 1_000_000.0}
-    assert ledger.finished == ("objects",) and ledger.result("objects") == {"train": 3}
-    assert ledger.software == ({"numpy": "1"}, {"numpy": "2"})
+    assert run_log.seconds == {"objects": 2.5, "collect-random": 1_000_000.0}
+    assert run_log.finished == ("objects",) and run_log.result("objects") == {"train": 3}
+    assert run_log.software == ({"numpy": "1"}, {"numpy": "2"})
     assert most < path.stat().st_size / 16
 
 
@@ -127,8 +127,8 @@ def test_a_log_that_cannot_be_written_for_a_while_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("cluster.runs.run_log.BEAT_S", 0.01)
-    ledger, failed = Ledger(tmp_path / "log.jsonl"), list[str]()
-    note = ledger.note
+    run_log, failed = RunLog(tmp_path / "log.jsonl"), list[str]()
+    note = run_log.note
 
     def full(event: str, **details: Any) -> None:
         if event == "beat" and not failed:
@@ -136,12 +136,12 @@ def test_a_log_that_cannot_be_written_for_a_while_ends_nothing(
             raise OSError(28, "No space left on device")
         note(event, **details)
 
-    monkeypatch.setattr(ledger, "note", full)
+    monkeypatch.setattr(run_log, "note", full)
 
     def run() -> Mapping[str, Any]:
         wait_until(lambda: bool(failed))
         return {}
 
-    ledger.run({"a": run}, lambda line: None)
-    assert ledger.finished == ("a",)
+    run_log.run({"a": run}, lambda line: None)
+    assert run_log.finished == ("a",)
     assert "Traceback" not in capfd.readouterr().err

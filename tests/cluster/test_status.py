@@ -15,14 +15,14 @@ from cluster.cli.main import run
 from cluster.collection.status_writer import SILENT_S, DriverStatus, State, read_status, status_kept
 from cluster.collection.tally import RECENT_S, CollectionProgress
 from cluster.runs.logs import JsonLines, Lines, configure
-from cluster.runs.run_log import Ledger
-from cluster.runs.status_snapshot import standing_of
-from collector.job_result import Receipt
+from cluster.runs.run_log import RunLog
+from cluster.runs.status_snapshot import snapshot_of
+from collector.job_result import JobResult
 from shared.errors import UsageError
 from shared.io.files import host_name, process_name
 from shared.plan import Job, Plan
 from shared.store import Store, verify
-from shared.store.crash_log import Crumb
+from shared.store.crash_log import Heartbeat
 from shared.store.provenance import note_machine
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 from tests.support.waiting import wait_until
@@ -61,12 +61,12 @@ def fill(where: str) -> Store:
 
 
 def written(store: Store, status: DriverStatus) -> None:
-    store.place.replace("status/driver.json", status.model_dump_json().encode())
+    store.backend.replace("status/driver.json", status.model_dump_json().encode())
 
 
 def test_a_store_says_what_is_done_and_left(where: str, capsys: pytest.CaptureFixture[str]) -> None:
     store = fill(where)
-    store.underway.leave(Crumb(shard_id="aip-v3-00000004-00000008", rollout=5))
+    store.crash_log.leave(Heartbeat(shard_id="aip-v3-00000004-00000008", rollout=5))
     written(store, status_of(written=time.time()))
     assert run(["status", where, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)["stores"][0]
@@ -83,9 +83,9 @@ def test_a_store_says_what_is_done_and_left(where: str, capsys: pytest.CaptureFi
     assert "35.0 interactions/s of late, 40.0 in all" in shown
     assert "2, 4 replaced; 1 rollouts quarantined" in shown
     assert "rollout 5" in shown
-    note_machine(store.place)
-    assert standing_of(where).stores[0].workers[0].host == host_name()
-    store.underway.forget(process_name())
+    note_machine(store.backend)
+    assert snapshot_of(where).stores[0].workers[0].host == host_name()
+    store.crash_log.forget(process_name())
     assert verify(store) == [], "how it stands is no data, and no stranger either"
 
 
@@ -94,7 +94,7 @@ def test_a_status_is_replaced_as_a_whole_and_leaves_the_digest_alone(where: str)
     digest = store.digest()
     for done in (1, 10_000, 2):
         written(store, status_of().model_copy(update={"done": done}))
-        found = read_status(store.place)
+        found = read_status(store.backend)
         assert found is not None and found.done == done
     assert store.digest() == digest
 
@@ -102,9 +102,9 @@ def test_a_status_is_replaced_as_a_whole_and_leaves_the_digest_alone(where: str)
 @pytest.mark.parametrize("content", [b"", b"{", b"null", b"[]", b'{"process": 1}', b"\xff" * 100, b" " * (1 << 17)])
 def test_a_damaged_status_is_none(where: str, content: bytes) -> None:
     store = fill(where)
-    store.place.replace("status/driver.json", content)
-    assert read_status(store.place) is None
-    assert standing_of(where).stores[0].driver is None
+    store.backend.replace("status/driver.json", content)
+    assert read_status(store.backend) is None
+    assert snapshot_of(where).stores[0].driver is None
 
 
 def test_a_driver_is_dead_when_it_says_so_or_nothing_more_or_its_process_is_gone() -> None:
@@ -122,10 +122,10 @@ def test_the_keeper_writes_while_it_works_says_when_it_waits_and_how_it_ended(tm
     store = fill(str(tmp_path / "store"))
     said: list[str] = []
     waiting = False
-    keeper = status_kept(store.place, lambda state: status_of(state), lambda: waiting, said.append, beat_s=0.01)
+    keeper = status_kept(store.backend, lambda state: status_of(state), lambda: waiting, said.append, beat_s=0.01)
 
     def wait_for(state: str) -> None:
-        wait_until(lambda: (found := read_status(store.place)) is not None and found.state == state)
+        wait_until(lambda: (found := read_status(store.backend)) is not None and found.state == state)
 
     with pytest.raises(KeyboardInterrupt), keeper:
         wait_for("collecting")
@@ -144,35 +144,35 @@ def test_a_status_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
         states.append(state)
         return status_of(state)
 
-    with status_kept(store.place, status, lambda: False, lambda line: None, beat_s=0.01):
+    with status_kept(store.backend, status, lambda: False, lambda line: None, beat_s=0.01):
         wait_until(lambda: len(states) > 1)
     assert {*states[:-1]} == {"collecting"} and states[-1] == "done", "it was tried again, and once more in the end"
-    assert read_status(store.place) is None
+    assert read_status(store.backend) is None
     assert (store.path / "status").read_text() == "a file in the place of the folder"
 
 
 def test_a_run_says_its_stages_and_its_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "config.json").write_text("{}")
-    ledger = Ledger(tmp_path / "log.jsonl")
-    with ledger.stage("objects") as done:
+    run_log = RunLog(tmp_path / "log.jsonl")
+    with run_log.stage("objects") as done:
         done({})
-    ledger.note("beat", stage="train-prior", seconds=65.0)
+    run_log.note("beat", stage="train-prior", seconds=65.0)
     fill(str(tmp_path / "store"))
     stage = tmp_path / "training" / "prior"
     stage.mkdir(parents=True)
     (stage / "metrics.jsonl").write_text('{"stage": "prior", "step": 50, "score": 0.5}\n{"stage": "prior", "st')
-    standing = standing_of(str(tmp_path))
-    assert (standing.stages_done, standing.stage, standing.stage_s) == (("objects",), "train-prior", 65.0)
-    assert standing.training is not None
-    assert (standing.training.stage, standing.training.step) == ("prior", 50)
+    snapshot = snapshot_of(str(tmp_path))
+    assert (snapshot.stages_done, snapshot.stage, snapshot.stage_s) == (("objects",), "train-prior", 65.0)
+    assert snapshot.training is not None
+    assert (snapshot.training.stage, snapshot.training.step) == ("prior", 50)
     assert run(["status", str(tmp_path)]) == 0
     assert "train-prior, 1:05" in capsys.readouterr().out
-    assert json.loads(json.dumps(as_json(standing)))["stores"][0]["driver"] is None
+    assert json.loads(json.dumps(as_json(snapshot)))["stores"][0]["driver"] is None
 
 
 def test_what_is_none_of_these_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(UsageError, match="no run, store or learner's folder"):
-        standing_of(str(tmp_path))
+        snapshot_of(str(tmp_path))
     assert run(["status", str(tmp_path / "none")]) == 2
     assert run(["status", str(tmp_path), "--every", "0"]) == 2
 
@@ -183,21 +183,21 @@ def test_text_from_files_is_no_markup(tmp_path: Path) -> None:
     store = fill(str(tmp_path / "store"))
     written(store, status_of().model_copy(update={"title": "[red]aip[/]\x1b]0;owned\x07"}))
     console = Console(record=True, width=200, file=io.StringIO())
-    console.print(table(standing_of(store.where), 1000.0))
+    console.print(table(snapshot_of(store.where), 1000.0))
     text = console.export_text()
     assert "[red]aip[/]" in text
     assert "\x1b" not in text and "\x07" not in text
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 20.0), st.integers(0, 100)), max_size=20))
-def test_the_recent_rate_counts_the_last_half_minute(receipts: list[tuple[float, int]]) -> None:
+def test_the_recent_rate_counts_the_last_half_minute(job_results: list[tuple[float, int]]) -> None:
     now = 0.0
     progress = CollectionProgress("t", 0, 10, "S", lambda: now)
-    for pause, count in receipts:
+    for pause, count in job_results:
         now += pause
-        progress(Receipt("s", 0, count, 0, {}, {}))
-    moments = [sum(pause for pause, _ in receipts[: k + 1]) for k in range(len(receipts))]
-    counted = sum(count for moment, (_, count) in zip(moments, receipts, strict=True) if now - moment < RECENT_S)
+        progress(JobResult("s", 0, count, 0, {}, {}))
+    moments = [sum(pause for pause, _ in job_results[: k + 1]) for k in range(len(job_results))]
+    counted = sum(count for moment, (_, count) in zip(moments, job_results, strict=True) if now - moment < RECENT_S)
     assert progress.recent_per_s * max(min(now, RECENT_S), 1e-9) == pytest.approx(counted)
 
 

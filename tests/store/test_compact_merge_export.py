@@ -35,7 +35,7 @@ def make(where: str | Path, *ranges: tuple[int, int], plan: Plan = PLAN) -> Stor
 
 
 def shard_names(store: Store) -> list[str]:
-    return [name for name in store.place.names("shards") if not name.startswith(".")]
+    return [name for name in store.backend.names("shards") if not name.startswith(".")]
 
 
 def rows_of(store: Store) -> list[tuple[int, int]]:
@@ -56,7 +56,7 @@ def test_compaction_changes_shards_and_nothing_else(kind: str, tmp_path: Path, r
     again = compact(store, 3)
     assert again.made == again.set_aside == ()
     assert identical(store.read_rollouts(done.made[0]), tuple(fabricate_rollouts(PLAN, Job(PLAN.key, 0, 2), 2)))
-    assert len(store.place.names("aside/shards")) == 4, "nothing is deleted"
+    assert len(store.backend.names("aside/shards")) == 4, "nothing is deleted"
 
 
 def test_a_compaction_that_fails_at_a_step_loses_and_doubles_nothing(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from shared.errors import SchemaVersionError, StoreError, UsageError
 from shared.plan import Job, Plan
 from shared.records import RolloutStatus
 from shared.store import Store, compact, export, info, merge, migrate, repair, verify
-from shared.store.codecs.checksummed import seal, unseal
+from shared.store.codecs.checksummed import with_checksum, without_checksum
 from shared.store.codecs.columns import ROLLOUT_COLUMNS, Column
 from shared.store.codecs.tables import read_table
 from shared.store.layout import Quarantined
@@ -62,7 +62,7 @@ def contents(path: Path) -> dict[str, bytes]:
 
 def edit(file: Path, **changes: Any) -> None:
     """Seal a document with other fields, as other software would have written it."""
-    file.write_bytes(seal(unseal(file.read_bytes(), "document") | changes))
+    file.write_bytes(with_checksum(without_checksum(file.read_bytes(), "document") | changes))
 
 
 def add_column(shard: Path, file: str, name: str, values: list[Any]) -> None:
@@ -70,9 +70,9 @@ def add_column(shard: Path, file: str, name: str, values: list[Any]) -> None:
     table = pq.read_table(shard / file)
     pq.write_table(table.append_column(name, pa.array(values)), shard / file, use_dictionary=False)
     data = (shard / file).read_bytes()
-    manifest = unseal((shard / "manifest.json").read_bytes(), "manifest")
+    manifest = without_checksum((shard / "manifest.json").read_bytes(), "manifest")
     manifest["files"][file] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    (shard / "manifest.json").write_bytes(seal(manifest))
+    (shard / "manifest.json").write_bytes(with_checksum(manifest))
 
 
 def shards_of(store: Store) -> list[Path]:
@@ -102,7 +102,7 @@ def test_copies_leave_out_what_older_software_said_of_machines(tmp_path: Path) -
     reason = Quarantined(rollout=4, reason="it failed", command="")
     other.commit(PLAN, job, [*fabricate_rollouts(PLAN, Job(PLAN.key, 2, 4), 2), last], {}, [reason])
     for shard in [*shards_of(one), *shards_of(other)]:
-        described = unseal((shard / "manifest.json").read_bytes(), "manifest")
+        described = without_checksum((shard / "manifest.json").read_bytes(), "manifest")
         for each in described["quarantined"]:
             each["command"] = "adaafford store replay /home/somebody/store"
         provenance = {"host": "lab-7", "physics_s": "6.1"}
@@ -204,7 +204,7 @@ def test_what_newer_software_wrote_is_ignored_and_kept(tmp_path: Path) -> None:
         add_column(shard, "interactions.parquet", "finger_force", [1.5 + k, 2.5 + k])
         add_column(shard, "rollouts.parquet", "weather", [f"day {k}"])
         edit(shard / "manifest.json", more={"a": 1})
-    setting = unseal((store.path / "store.json").read_bytes(), "store")["setting"]
+    setting = without_checksum((store.path / "store.json").read_bytes(), "store")["setting"]
     setting["collection"]["camera"]["noise"] = 0.5
     setting["objects"][0]["maker"] = "somebody"
     edit(store.path / "store.json", more=7, setting=setting)
@@ -311,10 +311,10 @@ def make_older(path: Path) -> str:
         table = pq.read_table(folder / "rollouts.parquet").drop_columns(["fidelity"])
         pq.write_table(table, folder / "rollouts.parquet", use_dictionary=False)
         data = (folder / "rollouts.parquet").read_bytes()
-        manifest = unseal((folder / "manifest.json").read_bytes(), "manifest")
+        manifest = without_checksum((folder / "manifest.json").read_bytes(), "manifest")
         manifest["files"]["rollouts.parquet"] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
         manifest["cloud_size"] = manifest.pop("points")
-        (folder / "manifest.json").write_bytes(seal(manifest | {"schema_version": 0}))
+        (folder / "manifest.json").write_bytes(with_checksum(manifest | {"schema_version": 0}))
     for file in (path / "store.json", path / "policies/000001/index.json"):
         edit(file, schema_version=0)
     return digest

@@ -20,7 +20,7 @@ from shared.io.documents import MAX_VALUES, parse_object
 from shared.networks.network_config import NetworkConfig
 from shared.plan import Job, Plan
 from shared.store import Store, info, verify
-from shared.store.codecs.checksummed import canonical, seal, unseal
+from shared.store.codecs.checksummed import canonical, with_checksum, without_checksum
 from shared.store.codecs.columns import INTERACTION_COLUMNS, MAX_JOINT_NAMES, MAX_TEXT
 from shared.store.codecs.observations import ARRAYS
 from shared.store.codecs.tables import read_table
@@ -60,11 +60,11 @@ def shard(store: Store) -> Path:
 
 def forge(shard: Path, contents: dict[str, bytes], **changes: Any) -> None:
     """Put files into a shard and make its manifest vouch for them, as somebody with ill intent would."""
-    manifest = unseal((shard / "manifest.json").read_bytes(), "manifest")
+    manifest = without_checksum((shard / "manifest.json").read_bytes(), "manifest")
     for name, data in contents.items():
         (shard / name).write_bytes(data)
         manifest["files"][name] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    (shard / "manifest.json").write_bytes(seal(manifest | changes))
+    (shard / "manifest.json").write_bytes(with_checksum(manifest | changes))
 
 
 def packed(table: Any, **options: Any) -> bytes:
@@ -233,7 +233,7 @@ def test_tables_of_other_length_are_refused(store: Store, shard: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../../store.json", "/etc/passwd", "observations.zarr/../x", "a\n", "extra"])
 def test_paths_of_a_manifest_are_never_followed(store: Store, shard: Path, name: str) -> None:
-    manifest = unseal((shard / "manifest.json").read_bytes(), "manifest")
+    manifest = without_checksum((shard / "manifest.json").read_bytes(), "manifest")
     entry = manifest["files"]["rollouts.parquet"]
     forge(shard, {}, files=manifest["files"] | {name: entry})
     refused(store.committed, "lists other files")
@@ -260,7 +260,7 @@ def test_absurd_manifests_are_refused(store: Store, shard: Path, changes: dict[s
 
 
 def test_absurd_file_sizes_are_refused(store: Store, shard: Path) -> None:
-    manifest = unseal((shard / "manifest.json").read_bytes(), "manifest")
+    manifest = without_checksum((shard / "manifest.json").read_bytes(), "manifest")
     manifest["files"]["rollouts.parquet"]["size"] = 10**12
     forge(shard, {}, files=manifest["files"])
     refused(store.committed, "claims 1000000000000 bytes for rollouts.parquet")
@@ -431,12 +431,12 @@ def test_links_are_not_followed(store: Store, shard: Path, tmp_path: Path) -> No
 
 def test_a_hostile_policy_is_refused(store: Store) -> None:
     folder = store.path / "policies" / "000001"
-    index = unseal((folder / "index.json").read_bytes(), "index")
+    index = without_checksum((folder / "index.json").read_bytes(), "index")
     entry = index["files"]["policy.json"]
     for files in ({"../../store.json": entry}, {"policy.json": entry | {"size": 2**40}}, {"policy.json": {"size": 2}}):
-        (folder / "index.json").write_bytes(seal(index | {"files": files}))
+        (folder / "index.json").write_bytes(with_checksum(index | {"files": files}))
         refused(lambda: store.read_policy(1), "index.json")
-    (folder / "index.json").write_bytes(seal(index | {"version": 2}))
+    (folder / "index.json").write_bytes(with_checksum(index | {"version": 2}))
     refused(lambda: store.read_policy(1), "not the index of policy 1")
 
 

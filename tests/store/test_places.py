@@ -16,7 +16,7 @@ from shared.networks.network_config import NetworkConfig
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
 from shared.store import Store, check_place, info, verify
-from shared.store.backends.base import Place, Publication, place_of
+from shared.store.backends.base import StorageBackend, Transaction, backend_of
 from shared.store.backends.local import DiskPlace
 from shared.store.backends.s3 import BucketPlace
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting, identical
@@ -27,20 +27,20 @@ JOB = Job(PLAN.key, 0, 2)
 
 
 @pytest.fixture
-def place(where: str) -> Place:
+def place(where: str) -> StorageBackend:
     if "://" not in where:
         Path(where).mkdir()
-    return place_of(where)
+    return backend_of(where)
 
 
-def publication(files: dict[str, bytes], folder: str = "shards/a") -> Publication:
+def publication(files: dict[str, bytes], folder: str = "shards/a") -> Transaction:
     def describe(held: object) -> bytes:
         return repr(sorted(dict(held).items())).encode()  # type: ignore[call-overload]
 
-    return Publication(folder, files, "mark.json", describe, admit=lambda: None, lock="lock")
+    return Transaction(folder, files, "mark.json", describe, check=lambda: None, lock="lock")
 
 
-def test_what_is_created_is_there_once(place: Place) -> None:
+def test_what_is_created_is_there_once(place: StorageBackend) -> None:
     assert not place.exists("plans/a.json")
     assert place.create("plans/a.json", b"first")
     assert not place.create("plans/a.json", b"second")
@@ -49,7 +49,7 @@ def test_what_is_created_is_there_once(place: Place) -> None:
     assert list(place.read_all([("plans/a.json", 9)] * 3)) == [b"first"] * 3
 
 
-def test_reading_is_bounded_and_says_what_is_missing(place: Place) -> None:
+def test_reading_is_bounded_and_says_what_is_missing(place: StorageBackend) -> None:
     place.create("a", b"12345")
     with pytest.raises(StoreError, match=r"/a: larger than the 4 bytes"):
         place.read("a", 4)
@@ -57,7 +57,7 @@ def test_reading_is_bounded_and_says_what_is_missing(place: Place) -> None:
         place.read("b", 4)
 
 
-def test_names_and_leaves_are_those_of_a_folder(place: Place) -> None:
+def test_names_and_leaves_are_those_of_a_folder(place: StorageBackend) -> None:
     for key in ("top", "shards/b/x", "shards/b/deep/y", "shards/a", "shards2/z"):
         place.create(key, b"")
     assert place.names("") == ["shards", "shards2", "top"]
@@ -67,7 +67,7 @@ def test_names_and_leaves_are_those_of_a_folder(place: Place) -> None:
     assert place.leaves("nothing") == []
 
 
-def test_names_from_one_on_come_in_order(place: Place) -> None:
+def test_names_from_one_on_come_in_order(place: StorageBackend) -> None:
     for name in "abcd":
         place.publish(publication({"x/y": b"1", "z": b"2"}, f"shards/{name}1"))
     assert list(place.names_from("shards", "b")) == ["b1", "c1", "d1"]
@@ -77,13 +77,13 @@ def test_names_from_one_on_come_in_order(place: Place) -> None:
 
 def test_more_names_than_one_page_are_listed(s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shared.store.backends.s3.PAGE", 3)
-    place = place_of(s3_url)
+    place = backend_of(s3_url)
     for k in range(10):
         place.create(f"shards/{k}", b"")
     assert len(place.leaves("shards")) == len(place.names("shards")) == 10
 
 
-def test_what_tells_of_the_moment_is_replaced_and_removed(place: Place) -> None:
+def test_what_tells_of_the_moment_is_replaced_and_removed(place: StorageBackend) -> None:
     for content in (b"first", b"", b"third and longer"):
         place.replace("status/a.json", content)
         assert place.read("status/a.json", 99) == content
@@ -93,14 +93,14 @@ def test_what_tells_of_the_moment_is_replaced_and_removed(place: Place) -> None:
         assert not place.exists("status/a.json")
 
 
-def test_the_first_publisher_wins(place: Place) -> None:
+def test_the_first_publisher_wins(place: StorageBackend) -> None:
     assert place.publish(publication({"x": b"1", "d/y": b"2"}))
     assert not place.publish(publication({"x": b"1", "d/y": b"2"}))
     assert place.leaves("shards/a") == ["shards/a/d/y", "shards/a/mark.json", "shards/a/x"]
     assert place.read("shards/a/mark.json", 99) == b"[('d/y', b'2'), ('x', b'1')]"
 
 
-def test_a_publisher_takes_over_or_replaces_what_a_dead_one_left(place: Place) -> None:
+def test_a_publisher_takes_over_or_replaces_what_a_dead_one_left(place: StorageBackend) -> None:
     place.create("shards/a/x", b"of the dead")
     assert place.publish(publication({"x": b"1", "y": b"2"}))
     held = place.read("shards/a/x", 99)
@@ -108,7 +108,7 @@ def test_a_publisher_takes_over_or_replaces_what_a_dead_one_left(place: Place) -
     assert place.read("shards/a/mark.json", 99) == repr([("x", held), ("y", b"2")]).encode()
 
 
-def test_moving_a_folder_moves_everything_in_it_and_can_be_repeated(place: Place) -> None:
+def test_moving_a_folder_moves_everything_in_it_and_can_be_repeated(place: StorageBackend) -> None:
     place.publish(publication({"x": b"1", "d/y": b"2"}))
     for _ in range(2):
         place.move("shards/a", "aside/a")
@@ -166,7 +166,7 @@ def test_a_half_written_shard_of_the_same_content_is_finished(s3_url: str) -> No
     other = Store.create(f"{s3_url}-other", SETTING)
     shard = other.commit(PLAN, JOB, slower(fabricate_rollouts(PLAN, JOB)), {}).shard_id
     for name in ("interactions.parquet", "observations.zarr/zarr.json"):
-        store.place.create(f"shards/{shard}/{name}", other.place.read(f"shards/{shard}/{name}", 1 << 20))
+        store.backend.create(f"shards/{shard}/{name}", other.backend.read(f"shards/{shard}/{name}", 1 << 20))
     assert store.committed() == []
     assert verify(store) == [], "somebody may be writing it"
     store.commit(PLAN, JOB, fabricate_rollouts(PLAN, JOB), {})
@@ -176,7 +176,7 @@ def test_a_half_written_shard_of_the_same_content_is_finished(s3_url: str) -> No
 
 def test_a_half_written_shard_of_other_content_is_refused(s3_url: str) -> None:
     store = Store.create(s3_url, SETTING)
-    store.place.create(f"shards/{JOB.shard_id}/rollouts.parquet", b"something else")
+    store.backend.create(f"shards/{JOB.shard_id}/rollouts.parquet", b"something else")
     with pytest.raises(StoreError, match=r"store repair|cannot be decoded"):
         store.commit(PLAN, JOB, fabricate_rollouts(PLAN, JOB), {})
     assert store.committed() == []
@@ -248,7 +248,7 @@ def test_a_bucket_place_needs_no_locks(s3_url: str) -> None:
         assert place.sweep(["", "shards"]) == 0
 
 
-def test_one_of_several_writers_wins_and_the_check_leaves_nothing_behind(place: Place) -> None:
+def test_one_of_several_writers_wins_and_the_check_leaves_nothing_behind(place: StorageBackend) -> None:
     check_place(place, writers=16, rounds=5)
     assert place.leaves("") == []
 
@@ -324,7 +324,7 @@ def test_no_store_is_created_in_a_bucket_where_every_writer_wins(s3_url: str, mo
     monkeypatch.setattr(BucketPlace, "create", forgets)
     with pytest.raises(StoreError, match=r"8 of 8 concurrent writers .* could lose data"):
         Store.create(s3_url, SETTING)
-    assert place_of(s3_url).leaves("") == []
+    assert backend_of(s3_url).leaves("") == []
 
 
 def test_check_place_prints_a_line(where: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from shared.errors import UsageError
 from shared.io import private
 from shared.io.files import process_name
 from shared.io.private import private_folder
-from shared.store.crash_log import Crumb, Underway
+from shared.store.crash_log import CrashLog, Heartbeat
 
 OTHER = 54321
 """A user who is not this one, and need not exist."""
@@ -100,8 +100,8 @@ def test_what_somebody_else_has_put_there_is_not_used(kind: str, own: Path, tmp_
 
 @as_root
 def test_a_second_user_reads_and_replaces_nothing(own: Path) -> None:
-    underway = Underway(None, BUCKET)
-    with underway.open_fault_log() as log:
+    crash_log = CrashLog(None, BUCKET)
+    with crash_log.open_fault_log() as log:
         log.write(b"Fatal Python error: Aborted\n")
     (file,) = own.glob("underway-*/*.fault")
     attempts = (f"ls {own}", f"ls {file.parent}", f"cat {file}", f"ln -s /etc/passwd {file.parent}/link")
@@ -110,7 +110,7 @@ def test_a_second_user_reads_and_replaces_nothing(own: Path) -> None:
         by_other(attempt)
         assert by_other(attempt).stdout == ""
     assert by_other(f"cd {own}").returncode != 0
-    assert underway.fault_of(process_name()) == "Aborted"
+    assert crash_log.fault_of(process_name()) == "Aborted"
     assert [path.name for path in own.parent.iterdir()] == [own.name]
     assert [path.name for path in file.parent.iterdir()] == [file.name]
 
@@ -120,7 +120,7 @@ def test_a_second_user_who_was_there_first_learns_and_changes_nothing(own: Path,
     victim = tmp_path / "victim"
     victim.write_text("untouched")
     assert by_other(f"mkdir -m 777 {own} && ln -s {victim} {own}/ray").returncode == 0
-    with pytest.raises(UsageError, match="not a folder of this user alone"), Underway(None, BUCKET).open_fault_log():
+    with pytest.raises(UsageError, match="not a folder of this user alone"), CrashLog(None, BUCKET).open_fault_log():
         pass
     assert [path.name for path in own.iterdir()] == ["ray"]
     assert victim.read_text() == "untouched"
@@ -132,14 +132,14 @@ def test_crash_logs_and_heartbeats_go_through_no_link_and_wait_for_nobody(kind: 
     folder, victim = tmp_path / "underway", tmp_path / "victim"
     folder.mkdir()
     victim.write_text("untouched")
-    underway = Underway(folder)
+    crash_log = CrashLog(folder)
     for name in (f"{process_name()}.fault", f"{process_name()}.json"):
         if kind == "a link":
             (folder / name).symlink_to(victim)
         else:
             os.mkfifo(folder / name)
     with pytest.raises(OSError):
-        underway.open_fault_log()
+        crash_log.open_fault_log()
     with pytest.raises(OSError):
-        underway.leave(Crumb(shard_id="random-v0-00000000-00000001", rollout=0))
+        crash_log.leave(Heartbeat(shard_id="random-v0-00000000-00000001", rollout=0))
     assert victim.read_text() == "untouched"

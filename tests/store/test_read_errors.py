@@ -108,9 +108,9 @@ def disturb(name: str, where: str, digest: str, fault: Fault, out: Path) -> tupl
     after = Store.open(where)
     assert after.digest() == digest, what
     assert verify(after) == [], what
-    aside = after.place.names("aside/shards")
+    aside = after.backend.names("aside/shards")
     assert not aside or (name == "compact" and len(aside) <= 2), what
-    assert not after.place.names("aside/plans"), what
+    assert not after.backend.names("aside/plans"), what
     shutil.rmtree(out, ignore_errors=True)
     return taken, failed
 

@@ -163,9 +163,9 @@ def test_a_bucket_is_repaired_too(s3_url: str) -> None:
     store.publish_policy(1, {"policy.json": b"{}"})
     digest = store.digest()
     broken = [f"shards/{plan.key}-00000000-00000001" for plan in PLANS]
-    store.place.move(f"{broken[0]}/rollouts.parquet", "aside/rollouts.parquet")
-    store.place.move(f"{broken[1]}/manifest.json", "aside/manifest.json")
-    store.place.create(f"{broken[0]}/rollouts.parquet", b"something else")
+    store.backend.move(f"{broken[0]}/rollouts.parquet", "aside/rollouts.parquet")
+    store.backend.move(f"{broken[1]}/manifest.json", "aside/manifest.json")
+    store.backend.create(f"{broken[0]}/rollouts.parquet", b"something else")
     assert [problem.where for problem in verify(store)] == [f"{broken[0]}/rollouts.parquet"]
     repaired, done = repair(s3_url)
     assert sorted(done.set_aside) == sorted(broken)

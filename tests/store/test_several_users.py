@@ -24,7 +24,7 @@ from shared.io.files import is_gone, process_name
 from shared.plan import Job, Plan
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.store import Store, compact, merge, repair, verify
-from shared.store.crash_log import Crumb
+from shared.store.crash_log import Heartbeat
 from shared.store.presence import SILENT_S, Mark
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 
@@ -55,11 +55,11 @@ def upkeep(store: Store, tmp_path: Path) -> list[Any]:
 
 def test_nobody_repairs_compacts_or_merges_beside_a_driver(where: str, tmp_path: Path) -> None:
     store = make(where)
-    before = store.place.leaves("shards")
+    before = store.backend.leaves("shards")
     for act in upkeep(store, tmp_path):
         with store.only_driver(), pytest.raises(UsageError, match="is in use by process"):
             act()
-        assert [key for key in store.place.leaves("shards") if ".lock-" not in key] == [
+        assert [key for key in store.backend.leaves("shards") if ".lock-" not in key] == [
             key for key in before if ".lock-" not in key
         ]
     for act in upkeep(store, tmp_path / "again"):
@@ -68,7 +68,7 @@ def test_nobody_repairs_compacts_or_merges_beside_a_driver(where: str, tmp_path:
 
 
 def test_no_driver_begins_beside_a_repair(s3_url: str) -> None:
-    place = make(s3_url).place
+    place = make(s3_url).backend
     with place.only_one("driver", alone=True):
         for alone in (False, True):
             with pytest.raises(UsageError, match="in use by process"), place.only_one("driver", alone=alone):
@@ -87,7 +87,7 @@ def test_no_driver_begins_beside_a_repair(s3_url: str) -> None:
     ],
 )
 def test_a_holder_that_is_silent_or_dead_is_forgotten(mark: Mark, s3_url: str) -> None:
-    place = make(s3_url).place
+    place = make(s3_url).backend
     place.replace("status/driver-dead.json", mark.model_dump_json().encode())
     with place.only_one("driver", alone=True):
         assert "driver-dead.json" not in place.names("status")
@@ -96,14 +96,14 @@ def test_a_holder_that_is_silent_or_dead_is_forgotten(mark: Mark, s3_url: str) -
 def test_a_bucket_is_not_repaired_while_a_worker_writes_a_shard(s3_url: str) -> None:
     store = make(s3_url, 1)
     half = f"shards/{Job(PLAN.key, 1, 2).shard_id}/rollouts.parquet"
-    store.place.create(half, b"some rows")
-    store.underway.leave(Crumb(shard_id="x", rollout=1, written=time.time()))
+    store.backend.create(half, b"some rows")
+    store.crash_log.leave(Heartbeat(shard_id="x", rollout=1, written=time.time()))
     with pytest.raises(UsageError, match="worker process"):
         repair(s3_url)
-    assert store.place.exists(half)
-    store.underway.forget(process_name())
-    crumb = Crumb(shard_id="x", rollout=1, written=time.time() - 3600)
-    store.place.replace(f"underway/{ELSEWHERE}.json", crumb.model_dump_json().encode())
+    assert store.backend.exists(half)
+    store.crash_log.forget(process_name())
+    heartbeat = Heartbeat(shard_id="x", rollout=1, written=time.time() - 3600)
+    store.backend.replace(f"underway/{ELSEWHERE}.json", heartbeat.model_dump_json().encode())
     assert repair(s3_url)[1].set_aside == (half.rpartition("/")[0],)
 
 
@@ -126,7 +126,7 @@ def test_the_commands_refuse_a_store_whose_driver_says_that_it_is_at_work(
         restarts=0,
         **counts,
     )
-    store.place.replace("status/driver.json", status.model_dump_json().encode())
+    store.backend.replace("status/driver.json", status.model_dump_json().encode())
     commands = (["repair", where], ["merge", str(other.path), "--out", where], ["compact", where])
     for command in commands:
         assert run(["store", *command]) == 2
@@ -134,7 +134,7 @@ def test_the_commands_refuse_a_store_whose_driver_says_that_it_is_at_work(
         assert ELSEWHERE in said
         assert said.count("\n") == 1
     silent = status.model_copy(update={"written": time.time() - 3600})
-    store.place.replace("status/driver.json", silent.model_dump_json().encode())
+    store.backend.replace("status/driver.json", silent.model_dump_json().encode())
     assert [run(["store", *command]) for command in commands] == [0, 0, 0]
 
 
@@ -143,7 +143,7 @@ def test_a_lost_plan_makes_no_rollout_twice(tmp_path: Path) -> None:
     store.publish_policy(2, {"policy.json": b"{}"})
     (store.path / "plans/aip-v1.json").unlink()
     collected = collect(store, Newest("aip"), 2, 1, pytest.fail, tmp_path)
-    assert collected.workers == 0, "both rollouts are there, so no fleet is opened"
+    assert collected.workers == 0, "both rollouts are there, so no worker group is opened"
 
 
 def policy_folder(path: Path, weights: bytes) -> Path:
@@ -188,12 +188,12 @@ def test_a_machine_of_the_same_name_sweeps_nothing_that_may_be_alive(tmp_path: P
     assert not is_gone(twin)
     assert is_gone(f"{space}~4194303~1")
     left = store.shards_folder / f".tmp-a~{twin}~abc"
-    crumb = store.path / "underway" / f"{twin}.json"
-    crumb.parent.mkdir()
-    for file in (left, crumb):
+    heartbeat = store.path / "underway" / f"{twin}.json"
+    heartbeat.parent.mkdir()
+    for file in (left, heartbeat):
         file.write_bytes(b"x")
     assert store.sweep() == 0
-    for file, days in ((left, 2), (crumb, 31)):
+    for file, days in ((left, 2), (heartbeat, 31)):
         os.utime(file, (time.time() - days * files.DAY_S,) * 2)
     assert store.sweep() == 2
 

@@ -23,7 +23,7 @@ from shared.errors import StoreError, UsageError
 from shared.plan import Job, ObjectRef, Plan
 from shared.records import RolloutRecord
 from shared.store import Store, info, verify
-from shared.store.codecs.checksummed import seal, unseal
+from shared.store.codecs.checksummed import with_checksum, without_checksum
 from shared.store.codecs.columns import COPIED_COLUMNS
 from shared.store.codecs.digest import rollout_digest
 from shared.store.layout import parse_shard_id
@@ -320,11 +320,11 @@ def test_what_a_killed_creator_left_is_no_foreign_file(tmp_path: Path) -> None:
 def test_another_schema_version_is_refused(tmp_path: Path) -> None:
     store = make(tmp_path / "store", (0, 1))
     for path in (store.path / "store.json", next(store.path.glob("shards/*/manifest.json"))):
-        content = unseal(path.read_bytes(), "it")
-        path.write_bytes(seal(content | {"schema_version": 99}))
+        content = without_checksum(path.read_bytes(), "it")
+        path.write_bytes(with_checksum(content | {"schema_version": 99}))
         with pytest.raises(StoreError, match="schema version 99, but this software reads 1 and 2"):
             Store.open(store.path).committed()
-        path.write_bytes(seal(content))
+        path.write_bytes(with_checksum(content))
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"{}", b"\xff\xfe", b'{"schema_version": 1}', b"[" * 100_000])
@@ -485,6 +485,6 @@ def test_a_plan_written_before_a_setting_existed_is_still_the_same_plan(tmp_path
     older = plan.model_dump(mode="json")
     del older["setting"]["collection"]["fidelity"]["end_holds_at_rest"]
     (tmp_path / "store" / "plans").mkdir()
-    (tmp_path / "store" / "plans" / f"{plan.key}.json").write_bytes(seal(older))
+    (tmp_path / "store" / "plans" / f"{plan.key}.json").write_bytes(with_checksum(older))
     store.add_plan(plan)
     assert store.plans() == (plan,)

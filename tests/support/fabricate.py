@@ -19,7 +19,7 @@ from shared.observation import round_normals, round_points
 from shared.plan import Job, ObjectRef, Plan, Setting
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store import Store
-from shared.store.codecs.checksummed import seal
+from shared.store.codecs.checksummed import with_checksum
 from shared.store.codecs.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, InteractionRow, RolloutRow
 from shared.store.codecs.digest import rollout_digest
 from shared.store.codecs.tables import table_bytes
@@ -204,5 +204,5 @@ def fabricate_store(path: Path, shards: int, rollouts: int = 2, points: int = 64
             "files": content["files"] | entries,
             "digests": [rollout_digest(one) for one in records],
         }
-        (folder / "manifest.json").write_bytes(seal(described))
+        (folder / "manifest.json").write_bytes(with_checksum(described))
     return store

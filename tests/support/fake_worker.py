@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from collector.job_result import Receipt
+from collector.job_result import JobResult
 from collector.watchdog import UnderWay
 from shared.errors import StoreError
 from shared.plan import Job, Plan
@@ -28,7 +28,7 @@ class FakeWorker:
         with (self.folder / f"pulled-{version}").open("a") as log:
             log.write(f"{os.getpid()}\n")
 
-    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> Receipt:
+    def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> JobResult:
         with (self.folder / "begun").open("a") as log:
             log.write(f"{job.shard_id} {os.getpid()}\n")
         if plan.policy_version:
@@ -41,7 +41,7 @@ class FakeWorker:
         for rollout, reason in quarantined.items():
             (self.folder / f"quarantined-{rollout}").write_text(reason)
         (self.folder / f"shard-{job.shard_id}").touch()
-        return Receipt(
+        return JobResult(
             job.shard_id,
             job.stop - job.start,
             4 * len(executed),

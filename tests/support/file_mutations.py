@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numcodecs.blosc import Blosc
 
-from shared.store.codecs.checksummed import seal
+from shared.store.codecs.checksummed import with_checksum
 from tests.support.mutations import damaged, pick
 
 T = TypeVar("T")
@@ -241,7 +241,7 @@ def vouch(root: Path, path: Path) -> None:
                 document = json.loads(seal_file.read_bytes())
                 document["files"][path.relative_to(seal_file.parent).as_posix()] = {"size": len(data), "sha256": digest}
                 document.pop("sha256")
-                seal_file.write_bytes(seal(document))
+                seal_file.write_bytes(with_checksum(document))
                 return
 
 
@@ -249,7 +249,7 @@ def _reseal(path: Path) -> None:
     try:
         document = json.loads(path.read_bytes())
         document.pop("sha256", None)
-        path.write_bytes(seal(document))
+        path.write_bytes(with_checksum(document))
     except (ValueError, AttributeError, TypeError, RecursionError):
         return
 

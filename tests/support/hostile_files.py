@@ -22,8 +22,8 @@ from torch import nn
 from adaafford.pretrained import load_policy
 from cluster.config.campaign_config import CampaignConfig
 from cluster.runs.run_folder import RunFolder, find
-from cluster.runs.run_log import Ledger
-from cluster.runs.status_snapshot import standing_of
+from cluster.runs.run_log import RunLog
+from cluster.runs.status_snapshot import snapshot_of
 from learner.alternation import best_score, trained_in
 from learner.data.dataset import load_dataset, read_object_list
 from learner.rounds import _published, _read_snapshot
@@ -203,7 +203,7 @@ def read_store(path: Path) -> list[str]:
         lambda: [store.read_rollouts(shard) for shard in sorted(shards)],
         store.rollouts,
         store.interactions,
-        lambda: standing_of(str(path)),
+        lambda: snapshot_of(str(path)),
         lambda: load_policy(path / "policies" / "000001"),
     )
 
@@ -272,8 +272,8 @@ def read_run(path: Path) -> list[str]:
     return each(
         lambda: find(path),
         RunFolder(path).objects_used,
-        lambda: Ledger(path / "log.jsonl"),
-        lambda: standing_of(str(path)),
+        lambda: RunLog(path / "log.jsonl"),
+        lambda: snapshot_of(str(path)),
         lambda: trained_in(path),
         lambda: best_score(path / "aip-1"),
         lambda: objects_seen(path / "aip-1"),

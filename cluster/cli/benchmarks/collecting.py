@@ -96,14 +96,14 @@ def summary(runs: Sequence[CollectionRun]) -> dict[str, Any]:
 
 
 def speedup(plan: Plan, folder: Path, rollouts: int, repeats: int, workers: int, advance: Advance) -> dict[str, Any]:
-    """Time the same jobs by one Ray worker and by several, turn by turn, with both fleets alive.
+    """Time the same jobs by one Ray worker and by several, turn by turn, with both worker groups alive.
 
     Args:
         plan: what is collected.
         folder: of the objects.
         rollouts: of each repeat; every repeat does others.
         repeats: how often.
-        workers: of the larger fleet.
+        workers: of the larger worker group.
         advance: called after each of the 2 x (`repeats` + 1) turns, of which the first is not timed: actors start.
 
     Returns:
@@ -111,28 +111,28 @@ def speedup(plan: Plan, folder: Path, rollouts: int, repeats: int, workers: int,
         same content.
     """
     # Ray is needed by several workers alone.
-    from cluster.workers.job_queue import Series
-    from cluster.workers.ray_group import RayFleet
+    from cluster.workers.job_queue import RolloutQueue
+    from cluster.workers.ray_group import RayWorkerGroup
     from cluster.workers.session import ray_session
     from cluster.workers.worker_group import make_worker
     from collector.watchdog import Limits
 
     with TemporaryDirectory(prefix="adaafford-bench-") as scratch, ExitStack() as stack:
-        # The fleet that waits uses no processor.
+        # The worker group that waits uses no processor.
         stack.enter_context(ray_session(workers + 1))
-        stores, fleets = [], []
+        stores, worker_groups = [], []
         for count in (1, workers):
             store = Store.create(Path(scratch) / f"store-{count}", plan.setting)
-            fleet = RayFleet(partial(make_worker, store.path, folder), store.underway, count, Limits())
-            stack.callback(fleet.close)
+            worker_group = RayWorkerGroup(partial(make_worker, store.path, folder), store.crash_log, count, Limits())
+            stack.callback(worker_group.close)
             stores.append(store)
-            fleets.append(fleet)
+            worker_groups.append(worker_group)
         walls: list[list[float]] = [[], []]
         for turn in range(repeats + 1):
-            for fleet, wall in zip(fleets, walls, strict=True):
+            for worker_group, wall in zip(worker_groups, walls, strict=True):
                 begun = time.perf_counter()
-                orders = Series(lambda: plan, [(turn * rollouts, (turn + 1) * rollouts)], ROLLOUTS_PER_SHARD)
-                fleet.run(orders, lambda _: None)
+                orders = RolloutQueue(lambda: plan, [(turn * rollouts, (turn + 1) * rollouts)], ROLLOUTS_PER_SHARD)
+                worker_group.run(orders, lambda _: None)
                 wall.append(time.perf_counter() - begun)
                 advance()
         alone, together = (wall[1:] for wall in walls)

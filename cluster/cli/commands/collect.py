@@ -110,7 +110,7 @@ def run_collection(command: CollectCommand) -> None:
     """Collect what is left of a command that was checked."""
     from cluster.collection.driver import Newest, collect
     from cluster.config.objects import objects_for
-    from cluster.workers.session import fleets
+    from cluster.workers.session import worker_groups
     from cluster.workers.worker_group import make_worker
     from collector.setting import make_setting, packages_used
     from collector.watchdog import Limits
@@ -146,15 +146,15 @@ def run_collection(command: CollectCommand) -> None:
     limits = Limits(chosen.rollout_limit_s, chosen.memory_limit_mb)
     with (
         store.only_driver(alone=command.policy == "latest"),
-        fleets(chosen.workers, limits, chosen.ray_address) as make_fleet,
+        worker_groups(chosen.workers, limits, chosen.ray_address) as make_worker_group,
     ):
-        open_fleet = partial(make_fleet, partial(make_worker, where, folder), store.underway)
+        open_worker_group = partial(make_worker_group, partial(make_worker, where, folder), store.crash_log)
         collect(
             store,
             plan,
             chosen.rollouts,
             chosen.per_shard,
-            open_fleet,
+            open_worker_group,
             folder,
             retry_quarantined=command.retry_quarantined,
         )

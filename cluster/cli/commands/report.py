@@ -25,10 +25,10 @@ def main(args: list[str]) -> int:
     command = parse_flags(ReportCommand, args, "report")
     from cluster.reporting.report import print_report, write_report
     from cluster.runs.run_folder import find
-    from cluster.runs.run_log import Ledger
+    from cluster.runs.run_log import RunLog
 
     run, config = find(command.run)
-    if "evaluate" in Ledger(run.log).finished:
+    if "evaluate" in RunLog(run.log).finished:
         write_report(run, config, experiments=command.experiments, say=_say)
     print_report(run)
     return 0

@@ -14,7 +14,7 @@ from shared.errors import UsageError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from cluster.runs.status_snapshot import Standing, StoreStanding, TrainingStanding
+    from cluster.runs.status_snapshot import StatusSnapshot, StoreSnapshot, TrainingSnapshot
 
 MOST_WORKERS = 12
 """Workers that the table shows; --json has all."""
@@ -40,14 +40,14 @@ def main(args: list[str]) -> int:
     command = parse_flags(StatusCommand, args, "status")
     if command.every <= 0:
         raise UsageError(f"--every must be above 0; given {command.every}")
-    from cluster.runs.status_snapshot import standing_of
+    from cluster.runs.status_snapshot import snapshot_of
 
     if command.json:
-        print(json.dumps(as_json(standing_of(command.where)), indent=2))
+        print(json.dumps(as_json(snapshot_of(command.where)), indent=2))
     elif command.once or not sys.stdout.isatty():
         from rich.console import Console
 
-        Console(highlight=False).print(table(standing_of(command.where), time.time()))
+        Console(highlight=False).print(table(snapshot_of(command.where), time.time()))
     else:
         _watch(command)
     return 0
@@ -56,18 +56,18 @@ def main(args: list[str]) -> int:
 def _watch(command: StatusCommand) -> None:
     from rich.live import Live
 
-    from cluster.runs.status_snapshot import standing_of
+    from cluster.runs.status_snapshot import snapshot_of
 
-    with Live(table(standing_of(command.where), time.time()), auto_refresh=False) as live:
+    with Live(table(snapshot_of(command.where), time.time()), auto_refresh=False) as live:
         while True:
             time.sleep(command.every)
-            live.update(table(standing_of(command.where), time.time()), refresh=True)
+            live.update(table(snapshot_of(command.where), time.time()), refresh=True)
 
 
-def as_json(standing: "Standing") -> dict[str, Any]:
+def as_json(snapshot: "StatusSnapshot") -> dict[str, Any]:
     """All that is known, and what follows from it."""
-    told = asdict(standing)
-    for entry, store in zip(told["stores"], standing.stores, strict=True):
+    told = asdict(snapshot)
+    for entry, store in zip(told["stores"], snapshot.stores, strict=True):
         driver = store.driver
         if driver is not None:
             entry["driver"] = driver.model_dump() | {
@@ -79,11 +79,11 @@ def as_json(standing: "Standing") -> dict[str, Any]:
     return told
 
 
-def table(standing: "Standing", now: float) -> "Table":
+def table(snapshot: "StatusSnapshot", now: float) -> "Table":
     """The same for people.
 
     Args:
-        standing: what is known.
+        snapshot: what is known.
         now: seconds since 1970.
     """
     from rich.table import Table
@@ -97,20 +97,20 @@ def table(standing: "Standing", now: float) -> "Table":
         # As plain text: names and files may hold what rich takes for markup, or a terminal for commands.
         shown.add_row(Text(name, style="dim"), Text(plain(value)))
 
-    if standing.what != "store":
-        row(standing.what, standing.where)
-    if standing.what == "run":
-        row("stages done", ", ".join(standing.stages_done) or "none")
-        row("stage", f"{standing.stage}, {_duration(standing.stage_s)}" if standing.stage else "none under way")
-    for store in standing.stores:
+    if snapshot.what != "store":
+        row(snapshot.what, snapshot.where)
+    if snapshot.what == "run":
+        row("stages done", ", ".join(snapshot.stages_done) or "none")
+        row("stage", f"{snapshot.stage}, {_duration(snapshot.stage_s)}" if snapshot.stage else "none under way")
+    for store in snapshot.stores:
         for name, value in _store_rows(store, now):
             row(name, value)
-    if standing.training is not None:
-        row("training", _training_line(standing.training, now))
+    if snapshot.training is not None:
+        row("training", _training_line(snapshot.training, now))
     return shown
 
 
-def _store_rows(store: "StoreStanding", now: float) -> list[tuple[str, str]]:
+def _store_rows(store: "StoreSnapshot", now: float) -> list[tuple[str, str]]:
     held = ", ".join(f"{key} {count}" for key, count in store.rollouts.items()) or "none"
     policies = f"{len(store.policies)}, newest {store.policies[-1]}" if store.policies else "none"
     rows = [("store", store.where), ("rollouts", held), ("policies", policies)]
@@ -138,7 +138,7 @@ def _store_rows(store: "StoreStanding", now: float) -> list[tuple[str, str]]:
     return rows
 
 
-def _training_line(training: "TrainingStanding", now: float) -> str:
+def _training_line(training: "TrainingSnapshot", now: float) -> str:
     figures = ", ".join(f"{name} {value:.4g}" for name, value in list(training.metrics.items())[:MOST_METRICS])
     return f"{training.stage}, step {training.step}, {_duration(now - training.written)} ago: {figures}"
 

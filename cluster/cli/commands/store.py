@@ -244,13 +244,13 @@ def _described(record: "RolloutRecord") -> str:
 def _check_place(command: CheckPlaceCommand) -> int:
     from shared.errors import StoreError
     from shared.store import check_place
-    from shared.store.backends.base import place_of
+    from shared.store.backends.base import backend_of
 
     for name, given, most in (("writers", command.writers, MOST_WRITERS), ("rounds", command.rounds, MOST_ROUNDS)):
         least = 2 if name == "writers" else 1
         if not least <= given <= most:
             raise UsageError(f"--{name} {given}: allowed: {least} to {most}")
-    place = place_of(command.place)
+    place = backend_of(command.place)
     if not place.is_there():
         raise UsageError(f"{command.place}: there is no such folder; make it, or name another")
     try:

@@ -107,9 +107,9 @@ def _refuse_while_collecting(where: str) -> None:
     import time
 
     from cluster.collection.status_writer import SILENT_S, read_status
-    from shared.store.backends.base import place_of
+    from shared.store.backends.base import backend_of
 
-    status = read_status(place_of(where))
+    status = read_status(backend_of(where))
     if status is not None and status.is_alive(time.time()):
         raise UsageError(
             f"{where} is in use by process {status.process}, which collects {status.title}; wait for it or stop it "

@@ -16,7 +16,7 @@ from learner.data.dataset import Dataset, Split
 from learner.data.features import FrozenFeatures
 from learner.data.sampling import draw_numbers, order_rows, spread
 from learner.settings import TrainingConfig
-from learner.stages.trainers import BaselineTraining, Load, Recipe
+from learner.stages.trainers import BaselineTraining, Load, StageTrainer
 from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_loss
@@ -90,7 +90,7 @@ class SurpriseStage:
         return action_scoring_loss(logits, success, ordered.asked(context)[:, -1]), total
 
 
-def _train(recipe: Recipe, config: SurpriseConfig) -> TrainingResult:
+def _train(recipe: StageTrainer, config: SurpriseConfig) -> TrainingResult:
     network = recipe.policy.baseline(NAME, Surprise).requires_grad_(True)
     prior = FrozenPrior.of(recipe.policy.prior, recipe.known)
     return recipe.runner.train(SurpriseStage(network, recipe.dataset, recipe.parts, config, prior), config, NAME)

@@ -17,7 +17,7 @@ URL_SCHEME = "s3://"
 
 
 @dataclass(frozen=True, slots=True)
-class Publication:
+class Transaction:
     """A folder that comes to be there as a whole, by one file of it, the mark, that is written last.
 
     Attributes:
@@ -26,7 +26,7 @@ class Publication:
         mark: path of the mark within the folder.
         describe: the mark's content, for the files as they lie there: those given, or, where another writer was faster
             with some of them in a place that has no rename, that writer's. Raises StoreError where these will not do.
-        admit: raises StoreError if the folder may not be published after all.
+        check: raises StoreError if the folder may not be published after all.
         lock: writers of the same name take turns for the last step, where a place has locks.
     """
 
@@ -34,11 +34,11 @@ class Publication:
     files: Mapping[str, bytes]
     mark: str
     describe: Callable[[Mapping[str, bytes]], bytes]
-    admit: Callable[[], None]
+    check: Callable[[], None]
     lock: str
 
 
-class Place(Protocol):
+class StorageBackend(Protocol):
     """Files by key.
 
     No data that are there are ever overwritten, and nothing is deleted but remnants of dead writers; what tells of the
@@ -105,7 +105,7 @@ class Place(Protocol):
         """Remove such a file; it is no error if there is none."""
         ...
 
-    def publish(self, publication: Publication) -> bool:
+    def publish(self, publication: Transaction) -> bool:
         """Put a folder there unless it is there, with its mark; returns whether this call did it.
 
         Raises:
@@ -138,7 +138,7 @@ class Place(Protocol):
 class Folder:
     """A folder of a place; as text, what messages call it."""
 
-    place: Place
+    backend: StorageBackend
     key: str
 
     @property
@@ -147,23 +147,23 @@ class Folder:
         return self.key.rpartition("/")[2]
 
     def __str__(self) -> str:
-        return f"{self.place.where}/{self.key}"
+        return f"{self.backend.where}/{self.key}"
 
     def has(self, name: str) -> bool:
         """Whether it holds a file."""
-        return self.place.exists(f"{self.key}/{name}")
+        return self.backend.exists(f"{self.key}/{name}")
 
     def read(self, name: str, limit: int) -> bytes:
-        """One of its files; see `Place.read`."""
-        return self.place.read(f"{self.key}/{name}", limit)
+        """One of its files; see `StorageBackend.read`."""
+        return self.backend.read(f"{self.key}/{name}", limit)
 
     def read_all(self, wanted: Sequence[tuple[str, int]]) -> Iterator[bytes]:
-        """Several of its files; see `Place.read_all`."""
-        return self.place.read_all([(f"{self.key}/{name}", limit) for name, limit in wanted])
+        """Several of its files; see `StorageBackend.read_all`."""
+        return self.backend.read_all([(f"{self.key}/{name}", limit) for name, limit in wanted])
 
     def sub(self, name: str) -> "Folder":
         """A folder in it."""
-        return Folder(self.place, f"{self.key}/{name}")
+        return Folder(self.backend, f"{self.key}/{name}")
 
 
 def is_url(where: str | Path) -> bool:
@@ -171,7 +171,7 @@ def is_url(where: str | Path) -> bool:
     return isinstance(where, str) and "://" in where
 
 
-def place_of(where: str | Path) -> Place:
+def backend_of(where: str | Path) -> StorageBackend:
     """The place that a folder's path or an "s3://bucket/prefix" names.
 
     Raises:

@@ -6,7 +6,7 @@ from threading import Barrier
 
 from shared.errors import StoreError
 from shared.io.files import temporary_name
-from shared.store.backends.base import Place
+from shared.store.backends.base import StorageBackend
 
 WRITERS = 8
 ROUNDS = 3
@@ -14,53 +14,55 @@ _BYTES = 4096
 """Size of the test files."""
 
 
-def check_place(place: Place, writers: int = WRITERS, rounds: int = ROUNDS) -> None:
+def check_place(backend: StorageBackend, writers: int = WRITERS, rounds: int = ROUNDS) -> None:
     """Let several writers create one key at the same time, again and again; nothing is left behind.
 
     Args:
-        place: one that exists; only new keys are used, named like unfinished files.
+        backend: one that exists; only new keys are used, named like unfinished files.
         writers: of each key.
         rounds: of a new key each.
 
     Raises:
-        StoreError: the place breaks a promise of `Place`, or is out of reach.
+        StoreError: the place breaks a promise of `StorageBackend`, or is out of reach.
     """
     with ThreadPoolExecutor(writers) as pool:
         for _ in range(rounds):
             key = temporary_name("check")
             try:
-                _check_key(place, key, pool, writers)
+                _check_key(backend, key, pool, writers)
             except StoreError:
                 # Where writing is not allowed, removing is not, either; the first reason is the one to tell.
                 with suppress(StoreError):
-                    place.remove(key)
+                    backend.remove(key)
                 raise
-            place.remove(key)
-            if place.exists(key):
-                raise _broken(place, "a file is still there after it was removed")
+            backend.remove(key)
+            if backend.exists(key):
+                raise _broken(backend, "a file is still there after it was removed")
 
 
-def _check_key(place: Place, key: str, pool: ThreadPoolExecutor, writers: int) -> None:
+def _check_key(backend: StorageBackend, key: str, pool: ThreadPoolExecutor, writers: int) -> None:
     contents = [bytes([writer]) * _BYTES for writer in range(writers)]
     ready = Barrier(writers)
 
     def create(content: bytes) -> bool:
         ready.wait()
-        return place.create(key, content)
+        return backend.create(key, content)
 
     won = [content for content, made in zip(contents, pool.map(create, contents), strict=True) if made]
     if len(won) != 1:
-        raise _broken(place, f"{len(won)} of {writers} concurrent writers of one new file were told that they made it")
-    if place.create(key, b"late"):
-        raise _broken(place, "a writer was told that it made a file that was there already")
-    if place.read(key, _BYTES) != won[0]:
-        raise _broken(place, "a file does not hold what its one successful writer wrote")
-    if key not in place.names(""):
-        raise _broken(place, "a file is not listed directly after it was written")
+        raise _broken(
+            backend, f"{len(won)} of {writers} concurrent writers of one new file were told that they made it"
+        )
+    if backend.create(key, b"late"):
+        raise _broken(backend, "a writer was told that it made a file that was there already")
+    if backend.read(key, _BYTES) != won[0]:
+        raise _broken(backend, "a file does not hold what its one successful writer wrote")
+    if key not in backend.names(""):
+        raise _broken(backend, "a file is not listed directly after it was written")
 
 
-def _broken(place: Place, what: str) -> StoreError:
+def _broken(backend: StorageBackend, what: str) -> StoreError:
     return StoreError(
-        f"{place.where}: {what}, so a store here could lose data; a bucket needs a server that obeys "
+        f"{backend.where}: {what}, so a store here could lose data; a bucket needs a server that obeys "
         '"If-None-Match: *" also for concurrent puts, a folder a file system with hard links'
     )

@@ -21,7 +21,7 @@ from shared.io.files import (
     write_atomically,
     write_durably,
 )
-from shared.store.backends.base import Publication
+from shared.store.backends.base import Transaction
 from shared.store.layout import LOCK_PREFIX
 
 _LOCK_WAIT_S = 60.0
@@ -29,7 +29,7 @@ _LOCK_WAIT_S = 60.0
 
 
 class DiskPlace:
-    """See `shared.store.backends.base.Place`."""
+    """See `shared.store.backends.base.StorageBackend`."""
 
     writes_in_place = False
 
@@ -38,11 +38,11 @@ class DiskPlace:
         self.where = str(root)
 
     def is_there(self) -> bool:
-        """See `Place.is_there`."""
+        """See `StorageBackend.is_there`."""
         return stat.S_ISDIR(_mode(self.root))
 
     def read(self, key: str, limit: int) -> bytes:
-        """See `Place.read`; what is reached through a symbolic link below the first level is refused."""
+        """See `StorageBackend.read`; what is reached through a symbolic link below the first level is refused."""
         parts = PurePosixPath(key).parts
         for depth in range(2, len(parts)):
             # A link could lead anywhere. The first level may be one: a disk of its own for the shards, say.
@@ -51,19 +51,19 @@ class DiskPlace:
         return read_bounded(self._at(key), limit)
 
     def read_all(self, wanted: Sequence[tuple[str, int]]) -> Iterator[bytes]:
-        """See `Place.read_all`."""
+        """See `StorageBackend.read_all`."""
         return (self.read(key, limit) for key, limit in wanted)
 
     def exists(self, key: str) -> bool:
-        """See `Place.exists`."""
+        """See `StorageBackend.exists`."""
         return _mode(self._at(key)) != 0
 
     def exist(self, keys: Sequence[str]) -> Iterator[bool]:
-        """See `Place.exist`."""
+        """See `StorageBackend.exist`."""
         return map(self.exists, keys)
 
     def names(self, folder: str) -> list[str]:
-        """See `Place.names`."""
+        """See `StorageBackend.names`."""
         path = self._at(folder)
         if not stat.S_ISDIR(_mode(path)):
             return []
@@ -73,11 +73,11 @@ class DiskPlace:
             raise unreadable(path, error) from None
 
     def names_from(self, folder: str, first: str) -> Iterator[str]:
-        """See `Place.names_from`; a disk has no order of names, so all are listed."""
+        """See `StorageBackend.names_from`; a disk has no order of names, so all are listed."""
         return (name for name in self.names(folder) if name >= first)
 
     def leaves(self, folder: str) -> list[str]:
-        """See `Place.leaves`."""
+        """See `StorageBackend.leaves`."""
         found = []
         left = [folder] if stat.S_ISDIR(_mode(self._at(folder))) else []
         while left:
@@ -91,7 +91,7 @@ class DiskPlace:
         return sorted(found)
 
     def create(self, key: str, data: bytes) -> bool:
-        """See `Place.create`."""
+        """See `StorageBackend.create`."""
         path = self._at(key)
         if _mode(path):
             return False
@@ -99,17 +99,17 @@ class DiskPlace:
         return create_exclusively(path, data)
 
     def replace(self, key: str, data: bytes) -> None:
-        """See `Place.replace`."""
+        """See `StorageBackend.replace`."""
         path = self._at(key)
         path.parent.mkdir(exist_ok=True)
         write_atomically(path, data)
 
     def remove(self, key: str) -> None:
-        """See `Place.remove`."""
+        """See `StorageBackend.remove`."""
         self._at(key).unlink(missing_ok=True)
 
-    def publish(self, publication: Publication) -> bool:
-        """See `Place.publish`."""
+    def publish(self, publication: Transaction) -> bool:
+        """See `StorageBackend.publish`."""
         final = self._at(publication.folder)
         final.parent.mkdir(exist_ok=True)
         temporary = final.parent / temporary_name(final.name)
@@ -121,7 +121,7 @@ class DiskPlace:
             remove_tree(temporary)
 
     def move(self, key: str, new: str) -> None:
-        """See `Place.move`."""
+        """See `StorageBackend.move`."""
         old, target = self._at(key), self._at(new)
         if not _mode(old, follow=False):
             return
@@ -131,7 +131,7 @@ class DiskPlace:
         sync_folder(old.parent)
 
     def sweep(self, folders: Sequence[str]) -> int:
-        """See `Place.sweep`."""
+        """See `StorageBackend.sweep`."""
         remnants = [
             self._at(folder) / name
             for folder in folders
@@ -142,7 +142,7 @@ class DiskPlace:
 
     @contextmanager
     def only_one(self, name: str, *, alone: bool = False) -> Iterator[None]:
-        """See `Place.only_one`."""
+        """See `StorageBackend.only_one`."""
         with ExitStack() as held:
             try:
                 held.enter_context(exclusive_lock(self.root / f"{LOCK_PREFIX}{name}"))
@@ -156,14 +156,14 @@ class DiskPlace:
     def _at(self, key: str) -> Path:
         return self.root / key
 
-    def _move_into_place(self, temporary: Path, final: Path, publication: Publication) -> bool:
+    def _move_into_place(self, temporary: Path, final: Path, publication: Transaction) -> bool:
         """Rename a finished folder to its name; False where a published one has it already."""
         folder = final.parent
         # The lock makes one step of looking at what is there and of renaming; the data were written without it.
         with exclusive_lock(folder / f"{LOCK_PREFIX}{publication.lock}", _LOCK_WAIT_S):
             if _mode(final / publication.mark):
                 return False
-            publication.admit()
+            publication.check()
             if _mode(final):
                 # A folder of this name without its mark: half a copy, say. Under this name a sweep may remove it.
                 remnant = folder / temporary_name(final.name)

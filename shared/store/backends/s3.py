@@ -19,7 +19,7 @@ from obstore.store import S3Store
 
 from shared.errors import MissingError, StoreError, UnreadableError, UsageError
 from shared.io.redaction import without_secrets
-from shared.store.backends.base import URL_SCHEME, Publication
+from shared.store.backends.base import URL_SCHEME, Transaction
 from shared.store.presence import present
 
 AT_ONCE = 16
@@ -45,7 +45,7 @@ Answer = TypeVar("Answer")
 
 
 class BucketPlace:
-    """See `shared.store.backends.base.Place`."""
+    """See `shared.store.backends.base.StorageBackend`."""
 
     writes_in_place = True
 
@@ -80,12 +80,12 @@ class BucketPlace:
         return cls(f"{URL_SCHEME}{bucket}/{prefix}".rstrip("/"), client)
 
     def is_there(self) -> bool:
-        """See `Place.is_there`: prefixes always are, and that the bucket is not is an error of its own."""
+        """See `StorageBackend.is_there`: prefixes always are, and that the bucket is not is an error of its own."""
         self.names("")
         return True
 
     def read(self, key: str, limit: int) -> bytes:
-        """See `Place.read`."""
+        """See `StorageBackend.read`."""
 
         def get() -> bytes:
             answer = self._client.get(key)
@@ -98,13 +98,13 @@ class BucketPlace:
         return self._ask(get, key)
 
     def read_all(self, wanted: Sequence[tuple[str, int]]) -> Iterator[bytes]:
-        """See `Place.read_all`."""
+        """See `StorageBackend.read_all`."""
         if len(wanted) < 2:
             return (self.read(key, limit) for key, limit in wanted)
         return self._map(lambda pair: self.read(*pair), wanted)
 
     def exists(self, key: str) -> bool:
-        """See `Place.exists`."""
+        """See `StorageBackend.exists`."""
         try:
             self._ask(lambda: self._client.head(key), key, missing_is_error=False)
         except FileNotFoundError:
@@ -112,17 +112,17 @@ class BucketPlace:
         return True
 
     def exist(self, keys: Sequence[str]) -> Iterator[bool]:
-        """See `Place.exist`."""
+        """See `StorageBackend.exist`."""
         return self._map(self.exists, keys)
 
     def names(self, folder: str) -> list[str]:
-        """See `Place.names`."""
+        """See `StorageBackend.names`."""
         found = self._ask(lambda: self._client.list_with_delimiter(folder or None), folder)
         keys = [*found["common_prefixes"], *(entry["path"] for entry in found["objects"])]
         return sorted({key.rstrip("/").rpartition("/")[2] for key in keys})
 
     def names_from(self, folder: str, first: str) -> Iterator[str]:
-        """See `Place.names_from`; some pages of keys, however many there are before and after."""
+        """See `StorageBackend.names_from`; some pages of keys, however many there are before and after."""
         pages = self._client.list(f"{folder}/", offset=f"{folder}/{first}", chunk_size=PAGE)
         last = ""
         while page := self._ask(lambda: next(pages, None), folder):
@@ -133,12 +133,12 @@ class BucketPlace:
                 last = name
 
     def leaves(self, folder: str) -> list[str]:
-        """See `Place.leaves`."""
+        """See `StorageBackend.leaves`."""
         pages = self._ask(lambda: list(self._client.list(folder or None, chunk_size=PAGE)), folder)
         return sorted(entry["path"] for page in pages for entry in page)
 
     def create(self, key: str, data: bytes) -> bool:
-        """See `Place.create`."""
+        """See `StorageBackend.create`."""
         try:
             # One request each: a multipart upload could not be conditional with every server.
             self._ask(lambda: self._client.put(key, data, mode="create", use_multipart=False), key)
@@ -147,20 +147,20 @@ class BucketPlace:
         return True
 
     def replace(self, key: str, data: bytes) -> None:
-        """See `Place.replace`."""
+        """See `StorageBackend.replace`."""
         self._ask(lambda: self._client.put(key, data, use_multipart=False), key)
 
     def remove(self, key: str) -> None:
-        """See `Place.remove`."""
+        """See `StorageBackend.remove`."""
         try:
             self._ask(lambda: self._client.delete(key), key, missing_is_error=False)
         except FileNotFoundError:
             return
 
-    def publish(self, publication: Publication) -> bool:
-        """See `Place.publish`."""
+    def publish(self, publication: Transaction) -> bool:
+        """See `StorageBackend.publish`."""
         folder, mark = publication.folder, f"{publication.folder}/{publication.mark}"
-        publication.admit()
+        publication.check()
 
         def put(file: tuple[str, bytes]) -> bytes:
             key = f"{folder}/{file[0]}"
@@ -171,7 +171,7 @@ class BucketPlace:
         return self.create(mark, publication.describe(held))
 
     def move(self, key: str, new: str) -> None:
-        """See `Place.move`: everything is copied before anything goes."""
+        """See `StorageBackend.move`: everything is copied before anything goes."""
         leaves = self.leaves(key) or ([key] if self.exists(key) else [])
         for leaf in leaves:
             target = new + leaf[len(key) :]
@@ -181,11 +181,11 @@ class BucketPlace:
             self._ask(lambda leaf=leaf: self._client.delete(leaf), leaf)  # type: ignore[misc]
 
     def sweep(self, folders: Sequence[str]) -> int:
-        """See `Place.sweep`; here unfinished folders stay, for whoever finishes them."""
+        """See `StorageBackend.sweep`; here unfinished folders stay, for whoever finishes them."""
         return 0
 
     def only_one(self, name: str, *, alone: bool = False) -> AbstractContextManager[Any]:
-        """See `Place.only_one`; several drivers do no harm here, they only do the same work twice."""
+        """See `StorageBackend.only_one`; several drivers do no harm here, they only do the same work twice."""
         return present(self, name, alone=alone)
 
     def _map(self, act: Callable[[Any], Answer], items: Sequence[Any]) -> Iterator[Answer]:

@@ -15,33 +15,33 @@ def canonical(content: Any) -> bytes:
     return json.dumps(content, sort_keys=True, indent=2, allow_nan=False, ensure_ascii=True).encode() + b"\n"
 
 
-def seal(content: dict[str, Any]) -> bytes:
+def with_checksum(content: dict[str, Any]) -> bytes:
     """The document's bytes, with the checksum of its content added."""
     return canonical(content | {_SEAL: _checksum(content)})
 
 
-def unseal(data: bytes, source: str, values: int = MAX_VALUES) -> dict[str, Any]:
-    """The content of a document that `seal` wrote, of at most so many values.
+def without_checksum(data: bytes, source: str, values: int = MAX_VALUES) -> dict[str, Any]:
+    """The content of a document that `with_checksum` wrote, of at most so many values.
 
     Raises:
         StoreError: it is not JSON, not an object, or not what was sealed, byte for byte.
     """
-    return unsealed(parse_object(data, source, values), data, source)
+    return checked_content(parse_object(data, source, values), data, source)
 
 
-def unsealed(content: dict[str, Any], data: bytes, source: str) -> dict[str, Any]:
+def checked_content(content: dict[str, Any], data: bytes, source: str) -> dict[str, Any]:
     """The same of a document that is parsed already.
 
     Raises:
         StoreError: it is not what was sealed, byte for byte.
     """
     checksum = content.pop(_SEAL, None)
-    if checksum != _checksum(content) or seal(content) != data:
+    if checksum != _checksum(content) or with_checksum(content) != data:
         raise StoreError(f"{source}: its checksum does not match; the file is damaged: restore it from a copy")
     return content
 
 
-def is_sealed(content: dict[str, Any]) -> bool:
+def has_checksum(content: dict[str, Any]) -> bool:
     """Whether an object carries the checksum of the rest of it."""
     return content.get(_SEAL) == _checksum({name: value for name, value in content.items() if name != _SEAL})
 

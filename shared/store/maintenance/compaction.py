@@ -46,7 +46,7 @@ def compact(store: Store, most: int, progress: Callable[[int, int], None] | None
     """
     if not 2 <= most <= MAX_ROWS:
         raise UsageError(f"--rollouts {most} is not allowed; choose 2 to {MAX_ROWS}")
-    with alone(store.place):
+    with alone(store.backend):
         jobs = store.jobs()
         counting = _counting(jobs)
         # What an earlier compaction was killed before it could set aside.
@@ -54,7 +54,7 @@ def compact(store: Store, most: int, progress: Callable[[int, int], None] | None
         _check_alike(store, jobs)
         aside = [_retire(store, job) for job in spare]
         made, after = [], 0
-        for done, group in _groups(reader.read_manifests(store.place, counting), most):
+        for done, group in _groups(reader.read_manifests(store.backend, counting), most):
             after += 1
             if len(group) > 1:
                 made.append(_merge(store, group).shard_id)
@@ -76,7 +76,7 @@ def _counting(jobs: Sequence[Job]) -> list[Job]:
 def _check_alike(store: Store, jobs: Sequence[Job]) -> None:
     """Hold shards that hold the same rollouts to each other."""
     suspects, window = list(overlapping(jobs, lambda job: job)), Window()
-    for job, manifest in zip(suspects, reader.read_manifests(store.place, suspects), strict=True):
+    for job, manifest in zip(suspects, reader.read_manifests(store.backend, suspects), strict=True):
         if any(not twice.alike for twice in window.add(job, manifest.digests, job)):
             raise StoreError(f"{job.shard_id}: another shard says otherwise; run `adaafford store repair`")
 
@@ -109,11 +109,11 @@ def _fits(group: Sequence[ShardManifest], most: int) -> bool:
 def _merge(store: Store, group: Sequence[ShardManifest]) -> ShardManifest:
     """Commit one shard of what a run of them holds."""
     job = Job(group[0].plan_key, group[0].start, group[-1].stop)
-    shards = [reader.shard_folder(store.place, manifest.shard_id) for manifest in group]
+    shards = [reader.shard_folder(store.backend, manifest.shard_id) for manifest in group]
     rollouts = [rollout for pair in zip(shards, group, strict=True) for rollout in reader.read_rollouts(*pair)]
     tables = [reader.unknown_of(shard, manifest) for shard, manifest in zip(shards, group, strict=True)]
     whole = commit_shard(
-        store.place,
+        store.backend,
         job,
         rollouts,
         group[0].points,
@@ -132,5 +132,5 @@ def _merge(store: Store, group: Sequence[ShardManifest]) -> ShardManifest:
 
 def _retire(store: Store, job: Job) -> str:
     key = f"{SHARDS_FOLDER}/{job.shard_id}"
-    set_aside(store.place, key)
+    set_aside(store.backend, key)
     return key

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from shared.reproduction import OBJECTS, STORE, reproduction
-from shared.store.codecs.checksummed import seal
+from shared.store.codecs.checksummed import with_checksum
 from shared.store.layout import INTERACTIONS_FILE, ROLLOUTS_FILE, Quarantined, ShardManifest
 from shared.store.store import Store
 from shared.types import OutcomeKind
@@ -76,7 +76,7 @@ def info(store: Store) -> StoreInfo:
         shards += 1
         rollouts += manifest.rollouts
         observations += manifest.observations
-        size += manifest.bytes + len(seal(manifest.as_document()))
+        size += manifest.bytes + len(with_checksum(manifest.as_document()))
         quarantined += quarantined_in([manifest], store.where)
         for row in table.to_pylist():
             outcomes[row["outcome"]] += 1

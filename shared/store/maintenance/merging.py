@@ -57,7 +57,7 @@ def merge(
         plans[key] = Plan(setting=sources[0].setting, proposer=proposer, policy_version=version)
     store = Store.create(out, sources[0].setting, sources[0].document.more)
     holders = {each.job: each.source for each in reversed(held)}
-    with alone(store.place):
+    with alone(store.backend):
         for plan in plans.values():
             store.add_plan(plan)
         for source in sources:
@@ -89,7 +89,7 @@ def _agreeing(held: Sequence[_Held]) -> int:
     """
     window, in_several = Window(), 0
     for each in overlapping(held, lambda each: each.job):
-        manifest = reader.read_manifest(reader.shard_folder(each.source.place, each.job.shard_id))
+        manifest = reader.read_manifest(reader.shard_folder(each.source.backend, each.job.shard_id))
         for twice in window.add(each.job, manifest.digests, each.source):
             if not twice.alike:
                 raise StoreError(
@@ -115,14 +115,14 @@ def _refuse_overlaps(store: Store, ours: AbstractSet[Job]) -> None:
 def _copy(store: Store, source: Store, part: Part) -> None:
     if store.holds(part.job):
         return
-    shard = reader.shard_folder(source.place, part.shard.shard_id)
+    shard = reader.shard_folder(source.backend, part.shard.shard_id)
     manifest = reader.read_manifest(shard)
     if part.is_whole:
-        copy_shard(shard, manifest, store.place)
+        copy_shard(shard, manifest, store.backend)
         return
     rollouts = reader.read_rollouts(shard, manifest)[part.start - manifest.start : part.stop - manifest.start]
     commit_shard(
-        store.place,
+        store.backend,
         part.job,
         rollouts,
         manifest.points,

@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from shared.errors import SchemaVersionError, StoreError, UsageError
 from shared.io.documents import parse_object
 from shared.store import policies, reader
-from shared.store.backends.base import Folder, Place, place_of
-from shared.store.codecs.checksummed import seal, unseal
+from shared.store.backends.base import Folder, StorageBackend, backend_of
+from shared.store.codecs.checksummed import with_checksum, without_checksum
 from shared.store.layout import (
     HIDDEN_VERSION,
     MANIFEST_FILE,
@@ -80,7 +80,7 @@ def migrate(where: str | Path, out: str | Path, progress: Callable[[int, int], N
         SchemaVersionError: the store is of a newer version, or of one from which no step leads here.
         StoreError: a file is damaged, or the new folder holds something else.
     """
-    source, target = place_of(where), place_of(out)
+    source, target = backend_of(where), backend_of(out)
     if source.where == target.where:
         raise UsageError(f"{out}: is the store to migrate; name another with --out")
     if not source.is_there():
@@ -88,7 +88,7 @@ def migrate(where: str | Path, out: str | Path, progress: Callable[[int, int], N
     content = _document(source, STORE_FILE)
     version = content.get("schema_version")
     steps = _steps(version, str(where))
-    note = seal({"from": hashlib.sha256(seal(content)).hexdigest()})
+    note = with_checksum({"from": hashlib.sha256(with_checksum(content)).hexdigest()})
     if not target.create(_NOTE, note) and target.read(_NOTE, MAX_DOCUMENT_BYTES) != note:
         raise StoreError(f"{out}: holds the migration of another store; name another folder with --out")
     jobs = reader.committed_jobs(source)
@@ -96,7 +96,7 @@ def migrate(where: str | Path, out: str | Path, progress: Callable[[int, int], N
         for name in source.names(PLANS_FOLDER):
             if name.endswith(".json") and not name.startswith("."):
                 plan = _applied(steps, "plan", _document(source, f"{PLANS_FOLDER}/{name}"))
-                target.create(f"{PLANS_FOLDER}/{name}", seal(plan))
+                target.create(f"{PLANS_FOLDER}/{name}", with_checksum(plan))
         for policy in policies.policy_versions(source):
             policies.publish_policy(target, policy, _policy(source, policy))
         for done, job in enumerate(jobs, 1):
@@ -105,7 +105,7 @@ def migrate(where: str | Path, out: str | Path, progress: Callable[[int, int], N
                 _migrate_shard(steps, reader.shard_folder(source, job.shard_id), target)
             if progress is not None:
                 progress(done, len(jobs))
-        target.create(STORE_FILE, seal(_applied(steps, "store", content) | {"schema_version": SCHEMA_VERSION}))
+        target.create(STORE_FILE, with_checksum(_applied(steps, "store", content) | {"schema_version": SCHEMA_VERSION}))
     return Migrated(SCHEMA_VERSION - len(steps), len(jobs), Store.open(out).digest())
 
 
@@ -120,8 +120,8 @@ def _steps(version: Any, where: str) -> list[MigrationStep]:
     return [STEPS[number] for number in range(version, SCHEMA_VERSION)]
 
 
-def _document(place: Place, key: str) -> Content:
-    return unseal(place.read(key, MAX_DOCUMENT_BYTES), f"{place.where}/{key}")
+def _document(backend: StorageBackend, key: str) -> Content:
+    return without_checksum(backend.read(key, MAX_DOCUMENT_BYTES), f"{backend.where}/{key}")
 
 
 def _applied(steps: list[MigrationStep], what: str, content: Content) -> Content:
@@ -130,19 +130,19 @@ def _applied(steps: list[MigrationStep], what: str, content: Content) -> Content
     return content
 
 
-def _migrate_shard(steps: list[MigrationStep], old: Folder, target: Place) -> None:
-    described = _document(old.place, f"{old.key}/{MANIFEST_FILE}")
+def _migrate_shard(steps: list[MigrationStep], old: Folder, target: StorageBackend) -> None:
+    described = _document(old.backend, f"{old.key}/{MANIFEST_FILE}")
     files = _checked_files(old, described.get("files"))
     for step in steps:
         files, described = step.shard(files, described)
     source = f"{old}/{MANIFEST_FILE}"
-    manifest = parse_manifest(seal(described | {"schema_version": SCHEMA_VERSION}), source)
+    manifest = parse_manifest(with_checksum(described | {"schema_version": SCHEMA_VERSION}), source)
     commit_files(target, manifest, files)
 
 
-def _policy(place: Place, version: int) -> dict[str, bytes]:
+def _policy(backend: StorageBackend, version: int) -> dict[str, bytes]:
     """A policy's files, whatever schema version its index names."""
-    folder = Folder(place, f"{POLICIES_FOLDER}/{policies.folder_name(version)}")
+    folder = Folder(backend, f"{POLICIES_FOLDER}/{policies.folder_name(version)}")
     index = parse_object(folder.read(policies.INDEX_FILE, MAX_DOCUMENT_BYTES), str(folder))
     return _checked_files(folder, index.get("files"))
 

@@ -33,7 +33,7 @@ def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
         if not manifest.quarantined:
             continue
         rollouts = store.read_rollouts(manifest.shard_id)
-        unknown = reader.unknown_of(reader.shard_folder(store.place, manifest.shard_id), manifest)
+        unknown = reader.unknown_of(reader.shard_folder(store.backend, manifest.shard_id), manifest)
         wanted = {rollout.index for rollout in rollouts if rollout.status is RolloutStatus.QUARANTINED}
         kept = [Job(manifest.plan_key, *ends) for ends in _ranges(manifest.start, manifest.stop, wanted)]
         # What a compaction has not set aside yet holds these rollouts as well.
@@ -41,7 +41,7 @@ def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
         for job in kept:
             rest = Part(manifest.job, job.start, job.stop)
             commit_shard(
-                store.place,
+                store.backend,
                 job,
                 rollouts[job.start - manifest.start : job.stop - manifest.start],
                 manifest.points,
@@ -51,7 +51,7 @@ def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
                 unknown=Unknown({file: rest.of(table) for file, table in unknown.items()}, manifest.more),
             )
         for job in sorted(set(old) - set(kept), key=lambda job: job.stop - job.start):
-            set_aside(store.place, f"{SHARDS_FOLDER}/{job.shard_id}")
+            set_aside(store.backend, f"{SHARDS_FOLDER}/{job.shard_id}")
         count += len(wanted)
     return count
 

@@ -17,7 +17,7 @@ from shared.store.codecs.columns import COPIED_COLUMNS, InteractionRow, added_in
 from shared.store.codecs.digest import rollout_digest
 from shared.store.codecs.tables import column_values
 from shared.store.coverage import Window, overlapping
-from shared.store.crash_log import UNDERWAY_FOLDER
+from shared.store.crash_log import CRASH_LOG_FOLDER
 from shared.store.layout import (
     ASIDE_FOLDER,
     LOCK_PREFIX,
@@ -63,11 +63,11 @@ def verify(store: Store, progress: Callable[[int, int], None] | None = None) -> 
         UnreadableError: a disk, a network or a server refused, or something vanished meanwhile.
         SchemaVersionError: a document is of another schema version.
     """
-    jobs = reader.committed_jobs(store.place)
+    jobs = reader.committed_jobs(store.backend)
     problems = [*_plans_and_policies(store, jobs), *_strangers(store, jobs)]
     unsound = set()
     for done, job in enumerate(jobs, 1):
-        shard = reader.shard_folder(store.place, job.shard_id)
+        shard = reader.shard_folder(store.backend, job.shard_id)
         try:
             manifest = reader.read_manifest(shard)
         except StoreError as error:
@@ -79,7 +79,7 @@ def verify(store: Store, progress: Callable[[int, int], None] | None = None) -> 
         if progress is not None:
             progress(done, len(jobs))
     problems += _overlaps(store, [job for job in jobs if job not in unsound])
-    if not store.place.exists(STORE_FILE):
+    if not store.backend.exists(STORE_FILE):
         raise UnreadableError(f"{store.where}: vanished while it was verified; is its disk still there?")
     return problems
 
@@ -170,8 +170,8 @@ def _copies(shard: Folder, manifest: ShardManifest, rollouts: tuple[RolloutRecor
 
 
 def _plans_and_policies(store: Store, jobs: Sequence[Job]) -> Iterator[Problem]:
-    known, plans = {}, Folder(store.place, PLANS_FOLDER)
-    for name in store.place.names(PLANS_FOLDER):
+    known, plans = {}, Folder(store.backend, PLANS_FOLDER)
+    for name in store.backend.names(PLANS_FOLDER):
         if name.startswith(TEMPORARY_PREFIX):
             continue
         try:
@@ -185,13 +185,13 @@ def _plans_and_policies(store: Store, jobs: Sequence[Job]) -> Iterator[Problem]:
         folder = f"{POLICIES_FOLDER}/{folder_name(version)}"
         try:
             files = store.read_policy(version)
-            for name in store.place.names(folder):
+            for name in store.backend.names(folder):
                 if name not in (*files, INDEX_FILE):
                     yield _problem(f"{folder}/{name}", "no file of this policy; remove it")
         except StoreError as error:
-            damage(error, partial(store.read_policy, version), Folder(store.place, folder), INDEX_FILE)
-            there = folder_name(version) in store.place.names(POLICIES_FOLDER)
-            if there or not store.place.exists(lost_policy_key(version)):
+            damage(error, partial(store.read_policy, version), Folder(store.backend, folder), INDEX_FILE)
+            there = folder_name(version) in store.backend.names(POLICIES_FOLDER)
+            if there or not store.backend.exists(lost_policy_key(version)):
                 yield _problem(folder, str(error), store, broken=folder if there else "")
     for key in sorted({job.plan_key for job in jobs}):
         if key not in known:
@@ -200,28 +200,28 @@ def _plans_and_policies(store: Store, jobs: Sequence[Job]) -> Iterator[Problem]:
 
 def _strangers(store: Store, jobs: Sequence[Job]) -> Iterator[Problem]:
     """Files and folders that the store did not make, and shards that were never committed."""
-    ours = {STORE_FILE, PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER, UNDERWAY_FOLDER, STATUS_FOLDER, ASIDE_FOLDER}
+    ours = {STORE_FILE, PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER, CRASH_LOG_FOLDER, STATUS_FOLDER, ASIDE_FOLDER}
     passing = (TEMPORARY_PREFIX, LOCK_PREFIX)
-    for name in store.place.names(""):
+    for name in store.backend.names(""):
         if name not in ours and not name.startswith(passing):
             yield _problem(name, "no part of a store; remove it")
-    for name in store.place.names(POLICIES_FOLDER):
+    for name in store.backend.names(POLICIES_FOLDER):
         if not re.fullmatch(r"[0-9]{6}", name) and not name.startswith(passing):
             yield _problem(f"{POLICIES_FOLDER}/{name}", "no policy; remove it")
     committed = set(jobs)
-    for name in store.place.names(SHARDS_FOLDER):
+    for name in store.backend.names(SHARDS_FOLDER):
         job = parse_shard_id(name)
         if job is None:
             if not name.startswith(passing):
                 yield _problem(f"{SHARDS_FOLDER}/{name}", "no shard; remove it")
-        elif job not in committed and not store.place.writes_in_place and not store.holds(job):
+        elif job not in committed and not store.backend.writes_in_place and not store.holds(job):
             where = f"{SHARDS_FOLDER}/{name}"
             yield _problem(where, "has no manifest, so counts for nothing; collecting again replaces it")
 
 
 def _strangers_in_shard(shard: Folder, manifest: ShardManifest) -> Iterator[Problem]:
     ours = {f"{shard.key}/{name}" for name in (MANIFEST_FILE, *manifest.files)}
-    for key in shard.place.leaves(shard.key):
+    for key in shard.backend.leaves(shard.key):
         if key not in ours:
             yield _problem(key, "no file of this shard; remove it")
 
@@ -230,7 +230,7 @@ def _overlaps(store: Store, jobs: Sequence[Job]) -> Iterator[Problem]:
     """Shards that hold the same rollout of a plan; one that another holds wholly, and alike, awaits compaction."""
     suspects = list(overlapping(jobs, lambda job: job))
     window, before = Window(), None
-    for one, manifest in zip(suspects, reader.read_manifests(store.place, suspects), strict=True):
+    for one, manifest in zip(suspects, reader.read_manifests(store.backend, suspects), strict=True):
         alike = all(twice.alike for twice in window.add(one, manifest.digests, one))
         if before is None or before.plan_key != one.plan_key:
             before = one
