@@ -138,7 +138,7 @@ class FleetBenchmark:
         plan: handed out; as large as that of a real store, since it names all objects.
         guests: numbers of actors that share processes.
         processes: numbers of actors of a process each.
-        shards_per_s: of each worker group: jobs sleep the longer the more actors there are, as the driver would have it.
+        shards_per_s: of each worker group: jobs sleep longer with more actors, so that the driver has as much to do.
         seconds: of each worker group.
     """
 
@@ -203,7 +203,7 @@ class FleetBenchmark:
         )
 
     def _collect(self, worker_group: RayWorkerGroup, first: int, shards: int) -> list[int]:
-        """Hand out so many jobs, and take in job results as a collection does; the driver's memory after every tenth."""
+        """Hand out so many jobs and take in their results as a collection does; the memory after every tenth."""
         progress = CollectionProgress("", 0, PER_SHARD * shards, "")
         process, memory = psutil.Process(), []
 

@@ -182,7 +182,7 @@ class LearnerSettings(StrictModel):
     interaction: InteractionConfig = InteractionConfig()
     adaptation: AdaptationConfig = AdaptationConfig()
     baselines: Annotated[dict[Name, dict[str, Any]], tyro.conf.Suppress] = Field({}, exclude_if=lambda told: not told)
-    """Of baselines that packages add, a table each by name, in files alone; `learner.stages.trainers.settings_of` checks it."""
+    """Of baselines that packages add, a table each by name; see `learner.stages.trainers.settings_of`."""
 
 
 class LearnerConfig(LearnerSettings):

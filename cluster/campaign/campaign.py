@@ -1,7 +1,7 @@
 """The campaign: the alternation over one folder, from the choice of objects to the report.
 
     objects, collect-random, train-prior,
-    train-aap-1, train-aip-1, publish-1,        (a run that starts from a policy has `warm_start` for the three trainings)
+    train-aap-1, train-aip-1, publish-1,        (a run that starts from a policy has `adopt` for the three trainings)
     collect-aip-1, train-aap-2, train-aip-2, publish-2, ...
     (before the last publication train-where2act-interaction, train-where2act-adaptation, where they are evaluated)
     evaluate, report

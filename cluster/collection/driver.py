@@ -1,4 +1,4 @@
-"""Drives collection over a worker group: what is committed stays, what is missing is done, and nothing is done twice."""
+"""Drives a collection by a worker group: committed rollouts stay, missing ones are made, and none is made twice."""
 
 import logging
 import time

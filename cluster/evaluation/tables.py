@@ -106,8 +106,8 @@ class EvaluationTable:
         policy_version: of the policy that was evaluated.
         store_digest: of the interactions that the figures are of.
         contents: of these objects, SHA-256 by id, since runs call other objects the same.
-        rows: a row for each method and budget: the fields of `learner.evaluation.table.EvaluationRow` ("best_f" for short),
-            and "gap_closed", the share of the gap in F-score between Where2Act and the oracle; None for no figure.
+        rows: a row for each method and budget: the fields of `learner.evaluation.table.EvaluationRow` ("best_f" for
+            short), and "gap_closed", the share of the gap in F-score between Where2Act and the oracle; None: no figure.
     """
 
     task: str

@@ -7,16 +7,11 @@ It dies with this process, however that dies. Each call is one line of the child
 function and its arguments; the answer is a line of `ENDED` and an exit code, after all that the function printed.
 """
 
-import ctypes
 import json
 import os
-import signal
 import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +24,10 @@ THREADS = 2
 PATIENCE_S = 10.0
 """How long a child may take to end when asked to."""
 OUTPUT_FILE = "output.txt"
+CHILD = "cluster.cli.child"
+"""The module that a child runs."""
 ENDED = "\x1e"
 """The ASCII record separator, which no other line begins with."""
-_PR_SET_PDEATHSIG = 1
 
 
 class Child:
@@ -99,7 +95,7 @@ def _start() -> "subprocess.Popen[str]":
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(THREADS))
     # A session of its own: Ctrl-C reaches this process alone, which then ends the child in an orderly way.
     return subprocess.Popen(
-        [*PYTHON, "-m", "cluster.runs.subprocesses", str(os.getpid())],
+        [*PYTHON, "-m", CHILD, str(os.getpid())],
         env={**own_environment(), **threads, "PYTHONUNBUFFERED": "1"},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -123,28 +119,3 @@ def _relay(
         last = line.rstrip() or last
         say(line.rstrip())
     return last, process.wait()
-
-
-def main() -> None:
-    """Be the child: call what comes, until no more can come."""
-    # Here instead of in a `preexec_fn` of the parent, which may deadlock in a process with threads (Linux).
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != int(sys.argv[1]):
-        sys.exit("the parent was gone before the child began")
-    from cluster.cli.main import begin_process, guarded
-
-    begin_process()
-    for line in sys.stdin:
-        function, arguments = json.loads(line)
-        module, _, name = function.partition(":")
-        code = guarded(partial(_call, module, name, arguments), ["train"])
-        print(f"{ENDED}{code}", flush=True)
-
-
-def _call(module: str, name: str, arguments: Mapping[str, Any]) -> int:
-    getattr(import_module(module), name)(**arguments)
-    return 0
-
-
-if __name__ == "__main__":
-    main()

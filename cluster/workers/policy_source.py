@@ -20,7 +20,7 @@ class PolicySource:
         store: where policies are published.
         proposer: who proposes.
         version: the policy; None: always the newest.
-        warm_start: is called with each plan before it is in force.
+        adopt: is called with each plan before it is in force.
         clock: monotonic seconds.
     """
 
@@ -29,13 +29,13 @@ class PolicySource:
         store: Store,
         proposer: str,
         version: int | None,
-        warm_start: Callable[[Plan], None],
+        adopt: Callable[[Plan], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._store = store
         self._proposer = proposer
         self._version = version
-        self._adopt = warm_start
+        self._adopt = adopt
         self._clock = clock
         self._looked = -LOOK_S
         self.plan: Plan | None = None

@@ -1,7 +1,8 @@
 """A process that decomposes meshes by CoACD, one after another, until its standard input ends.
 
-Each message, either way, is a length (unsigned 64 bits) and a list of meshes (`collector.objects.mesh_bytes`): one mesh in, its
-convex pieces out. The library cannot be interrupted, and a strange mesh may end its process: so it has one of its own.
+Each message, either way, is a length (unsigned 64 bits) and a list of meshes (`collector.objects.mesh_bytes`): one
+mesh in, its convex pieces out. The library cannot be interrupted, and a strange mesh may end its process, so it runs
+in a separate one.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Critics of a policy, asked about rows of a data set instead of what a camera sees (compare `shared.policies.critics`).
+"""Critics of a policy, asked about rows of a data set instead of a camera's view (compare `shared.policies.critics`).
 
 What does not depend on the tries is computed once for all rows. Shapes: Q rows asked about, K tries.
 """

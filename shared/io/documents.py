@@ -66,7 +66,7 @@ def parse_document(model: type[Model], data: bytes, source: str, remedy: str) ->
 
 
 def read_document(model: type[Model], path: Path, limit: int, remedy: str) -> Model:
-    """A model from a file of at most `limit` bytes; raises as `parse_document` and `shared.io.files.read_bounded` do."""
+    """A model from a file of at most `limit` bytes; raises as `parse_document` and `read_bounded` do."""
     return parse_document(model, read_bounded(path, limit), str(path), remedy)
 
 

@@ -1,4 +1,4 @@
-"""Starting modules of ours in processes of their own: `[*PYTHON, "-m", "cluster.runs.subprocesses"]`, `own_environment()`.
+"""Starting modules of ours in processes of their own: `[*PYTHON, "-m", "cluster.cli.child"]`, `own_environment()`.
 
 Python would look for them in the working folder first, where a user may have a folder called `shared` or `learner`.
 """

@@ -58,8 +58,8 @@ class Baseline:
     Attributes:
         network: makes the network, whatever its weights.
         critic: what a history of tries makes it believe; of an adapter whose policy holds the trained network.
-        training: "module:attribute" of its `learner.stages.trainers.BaselineTraining`. Only the learner imports that, since a
-            robot that carries the network does not train it.
+        training: "module:attribute" of its `learner.stages.trainers.BaselineTraining`. Only the learner imports that,
+            since a robot that carries the network does not train it.
         begin: makes the network as it is before training, from a trained prior; None: as `network` does.
         needs: networks that are trained before it; the last of them is the stage to start from.
     """

@@ -1,7 +1,7 @@
 """Where2Act-adaptation: Where2Act whose scores are corrected at points similar to those that were tried.
 
-How it is trained stands in `learner.stages.where2act_adaptation`. Shapes: N points of a cloud, A actions, S proposals at a
-point, Q points asked about, K tries.
+`learner.stages.where2act_adaptation` trains it. Shapes: N points of a cloud, A actions, S proposals at a point,
+Q points asked about, K tries.
 """
 
 from collections.abc import Sequence

@@ -304,8 +304,8 @@ class Store:
         """A pyarrow table, one row an interaction; "shard" and "observation" (index in it) find a row's cloud.
 
         Args:
-            columns: names (see `shared.store.codecs.columns`); None: all. "shard" and "observation" always come. A hidden
-                parameter that the store lacks has its default in every row, where the package that adds it says one.
+            columns: names (see `shared.store.codecs.columns`); None: all. "shard" and "observation" always come. A
+                hidden parameter that the store lacks has its default in every row, if its package is installed.
             plan_keys: rows of these plans only; None: all.
 
         Raises:

@@ -107,7 +107,7 @@ def copy_shard(source: Folder, manifest: ShardManifest, backend: StorageBackend)
     Args:
         source: the shard.
         manifest: its manifest.
-        backend: of the store that it is copied into; known to hold none of its rollouts, unless in a shard of this name.
+        backend: of the store that it is copied into; holds none of its rollouts, unless in a shard of this name.
 
     Raises:
         StoreError: the shard is damaged.

@@ -15,6 +15,7 @@ from benchmarks.straightforward import PublishedEncoder, PublishedStep, ball_nei
 from cluster.cli.benchmarks.learning import NETWORKS as CRITICS
 from cluster.cli.benchmarks.learning import stages_of
 from cluster.cli.main import run
+from learner import settings
 from learner.data.dataset import load_dataset, split
 from learner.settings import AapConfig, AipConfig, LearnerConfig, PriorConfig
 from shared.networks.network_config import NETWORKS
@@ -93,7 +94,7 @@ def test_the_benches_end_in_one_object(
     monkeypatch.setattr(learning, "POINTS", 1100)
     monkeypatch.setattr(straightforward, "POINTS", 1100)
     small = LearnerConfig(network=TINY, prior=PriorConfig(proposals=4))
-    for module in (learning, configuration):
+    for module in (learning, settings):
         monkeypatch.setattr(module, "LearnerConfig", lambda **settings: small.model_copy(update=settings))
     told = ["--store", str(store.path), "--repeats", "1", "--json", "--out", str(tmp_path)]
     assert run(["bench", "learner", *told, "--steps", "2", "--batch-rollouts", "3"]) == 0

@@ -103,6 +103,6 @@ def role_of(process: psutil.Process) -> Role | None:
         return Role.GCS
     if PROGRAM in command[:3]:
         return Role.LEARNER if command[3] in LEARNING else Role.DRIVER
-    if "cluster.runs.subprocesses" in command[1:4]:
+    if "cluster.cli.child" in command[1:4]:
         return Role.LEARNER
     return None

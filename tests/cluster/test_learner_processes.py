@@ -76,7 +76,7 @@ def test_an_interrupt_ends_it(learner: Path, tmp_path: Path) -> None:
 
     with closing(Child(interrupt)) as child, pytest.raises(KeyboardInterrupt):
         child.run(f"{STAND_IN}:act", {"what": "hang"}, tmp_path)
-    assert not [child for child in psutil.Process().children() if "cluster.runs.subprocesses" in child.cmdline()]
+    assert not [child for child in psutil.Process().children() if "cluster.cli.child" in child.cmdline()]
 
 
 def test_it_dies_with_a_driver_that_is_killed(learner: Path, tmp_path: Path) -> None:

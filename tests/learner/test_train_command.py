@@ -106,7 +106,7 @@ def train_in(child: Child, job: StageJob) -> None:
 def learners() -> list[psutil.Process]:
     """This process's children that train; other tests may have left it others."""
     living = [child for child in psutil.Process().children() if child.status() != psutil.STATUS_ZOMBIE]
-    return [child for child in living if "cluster.runs.subprocesses" in child.cmdline()]
+    return [child for child in living if "cluster.cli.child" in child.cmdline()]
 
 
 def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, tmp_path: Path) -> None:

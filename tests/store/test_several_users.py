@@ -201,7 +201,8 @@ def test_a_machine_of_the_same_name_sweeps_nothing_that_may_be_alive(tmp_path: P
 AS_USERS = """
 import json, os, sys, tempfile, time
 from pathlib import Path
-import cluster.cli.commands.upkeep, cluster.cli.commands.status, cluster.collection.status_writer, cluster.runs.status_snapshot
+import cluster.cli.commands.upkeep, cluster.cli.commands.status
+import cluster.collection.status_writer, cluster.runs.status_snapshot
 from cluster.cli.main import run
 from shared.store import Store, verify, compact, repair
 from tests.store.test_several_users import PLAN, make
