@@ -82,7 +82,7 @@ def measure(command: ScaleSettings) -> dict[str, Any]:
     with stored(command) as source, TemporaryDirectory(prefix="adaafford-bench-") as scratch:
         result: dict[str, Any] = source_of(command, source)
         sizes = command.actors, command.processes
-        worker_groups = FleetBenchmark(source.plans()[0], *sizes, command.shards_per_s, command.seconds)
+        worker_groups = WorkerGroupBenchmark(source.plans()[0], *sizes, command.shards_per_s, command.seconds)
         with Progress("worker groups of sleeping actors", worker_groups.turns) as progress:
             worker_groups.run(progress.advance)
         listing = ListingBenchmark(source, Path(scratch) / "large", command.shards)
@@ -103,7 +103,7 @@ def measure(command: ScaleSettings) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class FleetPoint:
+class WorkerGroupPoint:
     """A worker group that was kept busy with sleep.
 
     Attributes:
@@ -131,7 +131,7 @@ class FleetPoint:
     growth_bytes: float
 
 
-class FleetBenchmark:
+class WorkerGroupBenchmark:
     """Worker groups of several sizes, one after the other.
 
     Args:
@@ -149,7 +149,7 @@ class FleetBenchmark:
         self._sizes = {"guest": guests, "process": processes}
         self._shards_per_s = shards_per_s
         self._seconds = seconds
-        self.points: list[FleetPoint] = []
+        self.points: list[WorkerGroupPoint] = []
 
     @property
     def turns(self) -> int:
@@ -166,7 +166,7 @@ class FleetBenchmark:
                     self.points.append(self._measure(kind, actors))
                     advance()
 
-    def _measure(self, kind: str, actors: int) -> FleetPoint:
+    def _measure(self, kind: str, actors: int) -> WorkerGroupPoint:
         job_s = actors / self._shards_per_s
         each = max(2, round(self._seconds / job_s))
         with ExitStack() as stack:
@@ -189,7 +189,7 @@ class FleetBenchmark:
                 _cpu_s(servers) - served,
             )
         half = memory[len(memory) // 2 :]
-        return FleetPoint(
+        return WorkerGroupPoint(
             kind=kind,
             actors=actors,
             job_s=job_s,
@@ -293,7 +293,7 @@ def predict(driver_ms: Line, start_s: Line, wish: Wish, per_shard: int) -> Predi
     return Prediction(per_shard, job_s, shards, rate, rate * each_s, start_s(shards), int(job_s / each_s))
 
 
-def predictions(worker_groups: Sequence[FleetPoint], stores: Sequence[StorePoint], wish: Wish) -> dict[str, Any]:
+def predictions(worker_groups: Sequence[WorkerGroupPoint], stores: Sequence[StorePoint], wish: Wish) -> dict[str, Any]:
     """The lines through what was measured, and what they say of some sizes of shards."""
     guests = [point for point in worker_groups if point.kind == "guest"] or worker_groups
     # A slope below zero is noise, and would make the large look cheap.

@@ -1,6 +1,6 @@
 """What a process that executes rollouts owes those who depend on it: heartbeats, crash log, and bounds.
 
-    guard = Guard(underway, limits)
+    watchdog = Watchdog(crash_log, limits)
     guard.stand()                              # once, before anything that could crash
     with guard.job(job) as under_way:
         under_way(17)                          # before each rollout; None before and after them

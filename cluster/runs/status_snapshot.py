@@ -1,6 +1,6 @@
 """How a run or a store stands, from what lies on the disk or in the bucket alone: nobody who works there is asked.
 
-standing = standing_of("RUN")        # or a store, or the folder of a learner
+snapshot = snapshot_of("RUN")        # or a store, or the folder of a learner
 standing.stores[0].driver            # what its driver wrote down last
 """
 

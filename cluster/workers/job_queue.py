@@ -1,7 +1,7 @@
-"""Orders: which rollouts are made next, and under which plan.
+"""The job queue: which rollouts are made next, and under which plan.
 
-    orders = Series(lambda: plan, missing_ranges(100, done), per_shard=4)
-    while (order := orders.take()) is not None: ...
+    queue = RolloutQueue(lambda: plan, missing_ranges(100, done), per_shard=4)
+    while (order := queue.take()) is not None: ...
 
 A proposer makes a *series* of numbered rollouts, whichever versions of a policy it uses. Each number is handed out
 once, under the plan that is in force at that moment: always the same where a version was named, that of the newest

@@ -24,7 +24,7 @@ Cause = Literal["fault", "loss", "growth"]
 """Why a worker was replaced: of a rollout's making, killed from outside, or grown too large."""
 
 
-class FleetMetrics:
+class WorkerMetrics:
     """Counters of one driver; they start at 0 with it, as Prometheus expects of a process."""
 
     def __init__(self, workers: int) -> None:

@@ -18,7 +18,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from cluster.workers.job_queue import JobQueue, PlannedJob
-from cluster.workers.metrics import Cause, FleetMetrics
+from cluster.workers.metrics import Cause, WorkerMetrics
 from cluster.workers.retries import Backlog, Failure, RetryPolicy, of_environment
 from cluster.workers.slots import Slot, Slots, Task
 from cluster.workers.worker_group import WAIT_S
@@ -137,7 +137,7 @@ class RayWorkerGroup:
         self._in_flight = 0
         self._answered: SimpleQueue[Slot] = SimpleQueue()
         self._plans, self._policies = _Shelf(), _Shelf()
-        self._metrics = FleetMetrics(workers)
+        self._metrics = WorkerMetrics(workers)
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """See `WorkerGroup.load_policy`: one `ray.put`; actors pull it when a plan first needs it."""

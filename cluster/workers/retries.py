@@ -195,7 +195,7 @@ def of_environment(error: BaseException) -> bool:
 
 
 class Backlog:
-    """Orders to hand out: those that failed first, then new ones, and last those with a rollout to quarantine.
+    """Jobs to hand out: those that failed first, then new ones, and last those with a rollout to quarantine.
 
     Args:
         orders: the new ones.

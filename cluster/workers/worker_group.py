@@ -1,7 +1,7 @@
 """Worker groups: whoever executes the jobs of a plan. The serial one here, the Ray one in `cluster.workers.ray_group`.
 
     fleet.load_policy(1, files)                    # once a version
-    fleet.run(orders, on_receipt=print)            # any number of times, on the same live workers
+    worker_group.run(queue, on_result=print)           # any number of times, on the same live workers
     fleet.close()
 
 Jobs are idempotent by their shard: a worker that finds its shard committed does nothing. So a job may be submitted

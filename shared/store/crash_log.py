@@ -66,8 +66,8 @@ class CrashLog:
         url: of a store in a bucket.
 
     Example:
-        underway.leave(Crumb(shard_id=job.shard_id, rollout=17))    # the worker's process
-        underway.crumb_of(process), underway.fault_of(process)      # the driver, once that process has ended
+        crash_log.leave(Heartbeat(shard_id=job.shard_id, rollout=17))    # the worker's process
+        crash_log.heartbeat_of(process), crash_log.fault_of(process)   # the driver, once that process has ended
     """
 
     folder: Path | None

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.listing import ListingBenchmark, StorePoint
-from benchmarks.scaling import FleetPoint, Line, ScaleSettings, Wish, measure, predict, predictions
+from benchmarks.scaling import Line, ScaleSettings, Wish, WorkerGroupPoint, measure, predict, predictions
 from benchmarks.scaling_figure import draw
 from benchmarks.script import run_script
 from benchmarks.sleeping import Dormitory, Sleeper
@@ -25,8 +25,8 @@ def scale(*args: str) -> int:
     return run_script("scaling", ScaleSettings, measure, list(args))
 
 
-def point(job_s: float, driver_ms: float) -> FleetPoint:
-    return FleetPoint("guest", 100, job_s, 100, 2.0, driver_ms, 0.1, 0.99, 200.0, 0.0)
+def point(job_s: float, driver_ms: float) -> WorkerGroupPoint:
+    return WorkerGroupPoint("guest", 100, job_s, 100, 2.0, driver_ms, 0.1, 0.99, 200.0, 0.0)
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_a_made_up_store_is_listed_as_a_real_one_and_takes_further_shards(templa
     assert len(store.read_rollouts(store.jobs()[-1].shard_id)) == 4
 
 
-def test_a_sleeper_leaves_breadcrumbs_and_a_job_result_of_all_its_rollouts() -> None:
+def test_a_sleeper_leaves_heartbeats_and_a_job_result_of_all_its_rollouts() -> None:
     heartbeats: list[int | None] = []
     job_result = Sleeper(0.01).run(PLAN, Job(PLAN.key, 3, 6), {}, heartbeats.append)
     assert heartbeats == [3, 4, 5, None]

@@ -122,7 +122,7 @@ def test_progress_says_what_is_done_and_left_in_plain_lines(capsys: pytest.Captu
     assert len(lines) == 4
 
 
-class FakeFleet:
+class FakeWorkerGroup:
     workers = 1
 
     def __init__(self) -> None:
@@ -138,10 +138,10 @@ class FakeFleet:
 
 def test_the_same_live_worker_group_serves_all_rounds_of_a_store(tmp_path: Path) -> None:
     one, other = (Store.create(tmp_path / name, fabricate_setting()) for name in "ab")
-    made: list[FakeFleet] = []
+    made: list[FakeWorkerGroup] = []
 
     def make(factory: WorkerFactory, crash_log: CrashLog) -> WorkerGroup:
-        made.append(FakeFleet())
+        made.append(FakeWorkerGroup())
         return made[-1]
 
     crew = Crew(make)

@@ -216,7 +216,7 @@ def test_a_policy_is_a_version_or_the_latest(
     flags: list[str], policy: int | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     understood: list[CollectCommand] = []
-    monkeypatch.setattr("cluster.cli.commands.collect._collect", understood.append)
+    monkeypatch.setattr("cluster.cli.commands.collect.run_collection", understood.append)
     assert run(["collect", "--store", "S", *flags]) == 0
     assert understood[0].policy == policy
 

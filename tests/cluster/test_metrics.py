@@ -7,7 +7,7 @@ import pytest
 from ray.util.metrics import Gauge, Metric
 
 from cluster.workers import metrics
-from cluster.workers.metrics import FleetMetrics
+from cluster.workers.metrics import WorkerMetrics
 from collector.job_result import JobResult
 from shared.plan import Plan
 from shared.types import OutcomeKind
@@ -47,7 +47,7 @@ def job_result(**over: Any) -> JobResult:
 
 
 def test_job_results_add_up(values: Tally[tuple[str, ...]]) -> None:
-    worker_group = FleetMetrics(workers=7)
+    worker_group = WorkerMetrics(workers=7)
     for _ in range(3):
         worker_group.add(PLAN, job_result())
     worker_group.add(PLAN, job_result(successes=0, quarantined=1, outcomes={"ok": 0}))
@@ -67,7 +67,7 @@ def test_job_results_add_up(values: Tally[tuple[str, ...]]) -> None:
 
 
 def test_what_is_told_does_not_grow_with_what_is_collected(values: Tally[tuple[str, ...]]) -> None:
-    worker_group = FleetMetrics(workers=2)
+    worker_group = WorkerMetrics(workers=2)
     worker_group.add(PLAN, job_result())
     series = set(values)
     for number in range(100):

@@ -252,7 +252,7 @@ def test_workers_that_are_lost_as_they_start_end_the_run_only_if_none_ever_lives
             retries.record_failure(JOB, start)
 
 
-def test_a_breadcrumb_says_what_its_process_does(tmp_path: Path) -> None:
+def test_a_heartbeat_says_what_its_process_does(tmp_path: Path) -> None:
     crash_log = CrashLog(tmp_path / "underway")
     assert crash_log.heartbeat_of(process_name()) is None
     crash_log.leave(Heartbeat(shard_id=JOB.shard_id, rollout=5))
@@ -266,7 +266,7 @@ def test_a_breadcrumb_says_what_its_process_does(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [b"", b'{"shard_id"', b"[]", b'{"shard_id":"x","rollout":-1}', b"\xff" * 100_000])
-def test_half_a_breadcrumb_blames_nobody(tmp_path: Path, damage: bytes) -> None:
+def test_half_a_heartbeat_blames_nobody(tmp_path: Path, damage: bytes) -> None:
     (tmp_path / "host~1~1.json").write_bytes(damage)
     assert CrashLog(tmp_path).heartbeat_of("host~1~1") is None
     assert CrashLog(tmp_path).heartbeat_of("host~2~2") is None
@@ -277,9 +277,9 @@ def test_a_dead_process_leaves_its_last_words_until_they_are_swept(tmp_path: Pat
     store = new_store(tmp_path)
     script = (
         "import ctypes, pathlib, sys\n"
-        "from collector.watchdog import Guard, Limits; from shared.io.files import process_name\n"
-        "from shared.plan import Job; from shared.store.crash_log import Underway\n"
-        "guard = Guard(Underway(pathlib.Path(sys.argv[1])), Limits())\n"
+        "from collector.watchdog import Limits, Watchdog; from shared.io.files import process_name\n"
+        "from shared.plan import Job; from shared.store.crash_log import CrashLog\n"
+        "guard = Watchdog(CrashLog(pathlib.Path(sys.argv[1])), Limits())\n"
         "guard.stand(); print(process_name(), flush=True)\n"
         "with guard.job(Job('random-v0', 4, 8)) as under_way: under_way(5); ctypes.string_at(0)"
     )
@@ -357,7 +357,7 @@ def test_a_replayed_rollout_crashes_before_ones_eyes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["disk", "bucket"])
-def test_breadcrumbs_are_found_by_whoever_reaches_the_store(
+def test_heartbeats_are_found_by_whoever_reaches_the_store(
     kind: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     where = str(tmp_path / "store") if kind == "disk" else request.getfixturevalue("s3_url")

@@ -50,7 +50,7 @@ from shared.store import Store
 while True:
     try:
         store = Store.open(sys.argv[1])
-        print(json.dumps([len(store.jobs()), list(store.underway.heartbeats())]), flush=True)
+        print(json.dumps([len(store.jobs()), list(store.crash_log.heartbeats())]), flush=True)
     except StoreError:
         pass  # Not made yet.
     time.sleep(1.0)

@@ -56,7 +56,7 @@ def ray_worker_group(shared: tuple[WorkerGroup, Path], tmp_path: Path) -> Worker
 def worker_group(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> WorkerGroup:
     monkeypatch.setattr("cluster.workers.worker_group.WAIT_S", 0.02)
     if request.param == "ray":
-        found: WorkerGroup = request.getfixturevalue("ray_fleet")
+        found: WorkerGroup = request.getfixturevalue("ray_worker_group")
         return found
     return SerialWorkerGroup(partial(FakeWorker, tmp_path))
 
@@ -111,7 +111,7 @@ def test_a_failure_of_infrastructure_is_tried_again(worker_group: WorkerGroup, t
     assert begun(tmp_path, jobs(4)[2]) == 2
 
 
-@pytest.mark.parametrize("fleet", ["serial"], indirect=True)
+@pytest.mark.parametrize("worker_group", ["serial"], indirect=True)
 def test_a_rollout_that_always_fails_is_quarantined_after_three_attempts(
     worker_group: WorkerGroup, tmp_path: Path
 ) -> None:
@@ -138,7 +138,7 @@ def test_a_worker_group_goes_on_after_a_failed_run(worker_group: WorkerGroup, tm
 
 
 class Slow(Listed):
-    """Orders of which some are not there yet when they are asked for."""
+    """Jobs of which some are not there yet when they are asked for."""
 
     def __init__(self, count: int) -> None:
         super().__init__(plan(), jobs(count))

@@ -144,7 +144,7 @@ def test_our_commands_are_understood(
     compose: dict[str, Any], kuberay: dict[str, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     understood: list[Any] = []
-    monkeypatch.setattr(collect, "_collect", understood.append)
+    monkeypatch.setattr(collect, "run_collection", understood.append)
     monkeypatch.setattr(learn, "_learn", understood.append)
     modules = {"collect": collect, "learn": learn}
     for words in commands(compose, kuberay):

@@ -207,7 +207,7 @@ from cluster.cli.main import run
 from shared.store import Store, verify, compact, repair
 from tests.store.test_several_users import PLAN, make
 from shared.plan import Job
-from shared.store.crash_log import Crumb
+from shared.store.crash_log import Heartbeat
 from tests.support.fabricate import fabricate_rollouts
 
 def act(where, scratch, user, group, start):
@@ -218,7 +218,7 @@ def act(where, scratch, user, group, start):
     with store.only_driver():
         store.sweep()
         for k in range(start, start + 2):
-            store.underway.leave(Crumb(shard_id="x", rollout=k, written=time.time()))
+            store.crash_log.leave(Heartbeat(shard_id="x", rollout=k, written=time.time()))
             job = Job(PLAN.key, k, k + 1)
             store.commit(PLAN, job, fabricate_rollouts(PLAN, job, 1), {})
         store.place.replace("status/driver.json", b"{}")

@@ -1,8 +1,8 @@
 """Where a store lies: a folder of a disk, or a prefix of a bucket; files are named by key, such as "shards/x/y".
 
-place = place_of("s3://bucket/prefix")     # or a folder
+backend = backend_of("s3://bucket/prefix")   # or a folder
 place.read("store.json", limit=1 << 20)
-place.publish(Publication(...))            # a folder of files: wholly or not at all, and once
+backend.publish(Transaction(...))           # a folder of files: wholly or not at all, and once
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

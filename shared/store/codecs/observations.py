@@ -24,6 +24,7 @@ from zarr.storage import MemoryStore
 
 from shared.errors import StoreError
 from shared.io.documents import parse_object
+from shared.io.text import plain
 from shared.observation import NORMAL_STEPS, pack_normals, round_normals, round_points, unpack_normals
 from shared.types import Float, Float32, Observation
 
@@ -270,7 +271,7 @@ def _check_metadata(data: bytes, kind: ArrayKind, observations: int, points: int
     for name, value in implied.items():
         if claims[name] != value:
             raise StoreError(
-                f"{where}: Zarr metadata claim {name} {str(claims[name])[:120]}, not {value}; it is foreign"
+                f"{where}: Zarr metadata claim {name} {plain(str(claims[name]), 120)}, not {value}; it is foreign"
             )
 
 
