@@ -221,7 +221,7 @@ def act(where, scratch, user, group, start):
             store.crash_log.leave(Heartbeat(shard_id="x", rollout=k, written=time.time()))
             job = Job(PLAN.key, k, k + 1)
             store.commit(PLAN, job, fabricate_rollouts(PLAN, job, 1), {})
-        store.place.replace("status/driver.json", b"{}")
+        store.backend.replace("status/driver.json", b"{}")
     commands = (["store", "compact", where, "--rollouts", "4"], ["store", "repair", where], ["status", where])
     codes = [run(command) for command in commands]
     assert verify(store) == [] and codes == [0, 0, 0], codes
