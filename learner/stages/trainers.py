@@ -159,7 +159,7 @@ class StageTrainer:
         """Train the oracle critic, save it, and start AAP from it."""
         # Drawn on the CPU, so that the first weights are the same whatever device trains them.
         with torch.random.fork_rng(devices=[]), torch.device("cpu"):
-            torch.manual_seed(torch_seed(self.config.seed, "learner.stages.oracle") % 2**32)
+            torch.manual_seed(torch_seed(self.config.seed, "learner.oracle") % 2**32)
             critic = OracleCritic(copy.deepcopy(self.policy.aap), self.dataset.rows.facts.shape[1])
         critic.to(self.runner.hardware.device)
         config = self.config.aap
