@@ -138,6 +138,6 @@ def test_the_benchmark_from_end_to_end(tmp_path: Path, template: Store, capsys: 
         ("process", 2),
     ]
     assert all(each["driver_ms"] > 0 and 0.1 < each["ideal_share"] <= 1.0 for each in result["fleets"])
-    kept = next(tmp_path.glob("*-scale-*.json"))
+    kept = next(tmp_path.glob("*-scaling-*.json"))
     draw(result, json.loads(kept.read_text())["result"], tmp_path / "again.png")
     assert (tmp_path / "figure.png").stat().st_size > 10_000
