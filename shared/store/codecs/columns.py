@@ -46,10 +46,10 @@ class InteractionRow:
     interaction: InteractionRecord
     first_observation: int
 
-    def in_camera(self, vectors: Float, *, backend: bool) -> Float:
+    def in_camera(self, vectors: Float, *, place: bool) -> Float:
         """Columns [3] or [3, k] of the world in the camera's frame; a place is moved, a direction only turned."""
         pose = self.rollout.observations[self.interaction.observation].world_from_camera
-        turned: Float = pose[:3, :3].T @ (vectors - pose[:3, 3] if backend else vectors)
+        turned: Float = pose[:3, :3].T @ (vectors - pose[:3, 3] if place else vectors)
         return turned
 
 
@@ -232,13 +232,13 @@ def _action_columns() -> tuple[Column[InteractionRow], ...]:
         Column("point_index", "<i4", 0, "of p in the cloud", lambda x: a(x).point_index),
         Column("point", "<f8", 3, "p, world", lambda x: a(x).point),
         Column("rotation", "<f8", 9, "R, world, row by row", lambda x: a(x).rotation.ravel()),
-        Column("point_camera", "<f8", 3, "p, camera", lambda x: x.in_camera(a(x).point, backend=True), content=False),
+        Column("point_camera", "<f8", 3, "p, camera", lambda x: x.in_camera(a(x).point, place=True), content=False),
         Column(
             "rotation_camera",
             "<f8",
             9,
             "R, camera, row by row",
-            lambda x: x.in_camera(a(x).rotation, backend=False).ravel(),
+            lambda x: x.in_camera(a(x).rotation, place=False).ravel(),
             content=False,
         ),
         Column("normal", "<f8", 3, "surface normal at p, world", lambda x: i(x).normal),

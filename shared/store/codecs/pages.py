@@ -58,19 +58,19 @@ def _walk(data: bytes, column: Any, rows: int, most: int, most_pages: int) -> tu
     start = column.data_page_offset
     if column.has_dictionary_page and 0 < (column.dictionary_page_offset or 0) < start:
         start = column.dictionary_page_offset
-    backend, stop = start, start + column.total_compressed_size
+    place, stop = start, start + column.total_compressed_size
     if not 0 < start <= stop <= len(data):
         raise ValueError(f"column {name} lies outside of the file")
     size = values = pages = 0
-    while backend < stop:
-        header, backend = _struct(data, backend, stop)
+    while place < stop:
+        header, place = _struct(data, place, stop)
         kind_of_page, unpacked, packed = (header.get(field) for field in (1, 2, 3))
         about = header.get(_ABOUT.get(kind_of_page, 0)) if type(kind_of_page) is int else None
         if not isinstance(about, dict) or type(unpacked) is not int or type(packed) is not int:
             raise ValueError(f"column {name} has a page of an unknown kind")
         count, encoding = about.get(1), about.get(4 if kind_of_page == _DATA_V2 else 2)
-        size, pages, backend = size + max(unpacked, 0), pages + 1, backend + packed
-        if type(count) is not int or min(count, unpacked, packed) < 0 or backend > stop:
+        size, pages, place = size + max(unpacked, 0), pages + 1, place + packed
+        if type(count) is not int or min(count, unpacked, packed) < 0 or place > stop:
             raise ValueError(f"column {name} has a page that lies outside of it")
         if size > most or pages > most_pages:
             raise ValueError(f"column {name} unpacks to more than {most} bytes or {most_pages} pages")
@@ -88,30 +88,30 @@ def _walk(data: bytes, column: Any, rows: int, most: int, most_pages: int) -> tu
     return size, pages
 
 
-def _struct(data: bytes, backend: int, stop: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+def _struct(data: bytes, place: int, stop: int, depth: int = 0) -> tuple[dict[int, Any], int]:
     """The integers and structs in a struct, by field; texts are skipped."""
     fields: dict[int, Any] = {}
     field = 0
-    while backend < stop:
-        step, kind = data[backend] >> 4, data[backend] & 15
-        backend += 1
+    while place < stop:
+        step, kind = data[place] >> 4, data[place] & 15
+        place += 1
         if kind == 0:
-            return fields, backend
+            return fields, place
         if step:
             field += step
         else:
-            field, backend = _integer(data, backend, stop)
+            field, place = _integer(data, place, stop)
         if kind in (_TRUE, _FALSE):
             fields[field] = kind == _TRUE
         elif kind in (_SHORT, _INT, _LONG):
-            fields[field], backend = _integer(data, backend, stop)
+            fields[field], place = _integer(data, place, stop)
         elif kind == _BYTE:
-            backend += 1
+            place += 1
         elif kind == _BINARY:
-            length, backend = _varint(data, backend, stop)
-            backend += length
+            length, place = _varint(data, place, stop)
+            place += length
         elif kind == _STRUCT and depth < _DEEPEST:
-            fields[field], backend = _struct(data, backend, stop, depth + 1)
+            fields[field], place = _struct(data, place, stop, depth + 1)
         else:
             raise ValueError(f"a page's header has a field of kind {kind}")
         if len(fields) > _MOST_FIELDS:
@@ -119,23 +119,23 @@ def _struct(data: bytes, backend: int, stop: int, depth: int = 0) -> tuple[dict[
     raise ValueError("a page's header has no end")
 
 
-def _integer(data: bytes, backend: int, stop: int) -> tuple[int, int]:
+def _integer(data: bytes, place: int, stop: int) -> tuple[int, int]:
     # Most integers of a header have one byte.
-    if backend < stop and (number := data[backend]) < 128:
-        backend += 1
+    if place < stop and (number := data[place]) < 128:
+        place += 1
     else:
-        number, backend = _varint(data, backend, stop)
-    return (number >> 1) ^ -(number & 1), backend
+        number, place = _varint(data, place, stop)
+    return (number >> 1) ^ -(number & 1), place
 
 
-def _varint(data: bytes, backend: int, stop: int) -> tuple[int, int]:
+def _varint(data: bytes, place: int, stop: int) -> tuple[int, int]:
     number = 0
     for shift in range(0, 7 * _LONGEST_VARINT, 7):
-        if backend >= stop:
+        if place >= stop:
             break
-        byte = data[backend]
-        backend += 1
+        byte = data[place]
+        place += 1
         number |= (byte & 127) << shift
         if byte < 128:
-            return number, backend
+            return number, place
     raise ValueError("a page's header is cut off")
