@@ -104,7 +104,7 @@ def collect(
         in_force = PolicySource(store, plan.proposer, version, _Adopting(store, worker_group))
         counts = {key: covered(ranges) for key, ranges in held.items()}
         series = RolloutQueue(in_force, missing, per_shard, per_version, counts)
-        snapshot = _Standing(plan.key, already, rollouts, progress, worker_group, in_force)
+        snapshot = _Snapshot(plan.key, already, rollouts, progress, worker_group, in_force)
         try:
             with status_kept(store.backend, snapshot, lambda: series.waiting, progress.say):
                 worker_group.run(series, progress)
@@ -141,7 +141,7 @@ class _Adopting:
 
 
 @dataclass(frozen=True, slots=True)
-class _Standing:
+class _Snapshot:
     """Tells how a collection stands."""
 
     title: str

@@ -159,6 +159,7 @@ class StageTrainer:
         """Train the oracle critic, save it, and start AAP from it."""
         # Drawn on the CPU, so that the first weights are the same whatever device trains them.
         with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+            # This text is part of the seed: with another one, weights of earlier releases could not be made again.
             torch.manual_seed(torch_seed(self.config.seed, "learner.oracle") % 2**32)
             critic = OracleCritic(copy.deepcopy(self.policy.aap), self.dataset.rows.facts.shape[1])
         critic.to(self.runner.hardware.device)

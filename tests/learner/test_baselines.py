@@ -39,7 +39,6 @@ from tests.support.small_trainings import (
     QUICK,
     Killed,
     KilledError,
-    coins,
     descend,
     fabricated_plan,
     fabricated_rollouts,
@@ -52,21 +51,6 @@ ALL = FAST.model_copy(
         "adaptation": AdaptationConfig(steps=4, validate_every=2),
     }
 )
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("baselines")
-
-
-@pytest.fixture(scope="module")
-def dataset(folder: Path) -> Dataset:
-    return load_dataset(make_store(folder / "store"), TINY)
-
-
-@pytest.fixture(scope="module")
-def coin_dataset(dataset: Dataset) -> Dataset:
-    return coins(dataset)
 
 
 def stage_of(name: BaselineName, dataset: Dataset, policy: Policy) -> InteractionStage | AdaptationStage:

@@ -49,27 +49,11 @@ from tests.support.small_trainings import (
     FAST,
     Killed,
     KilledError,
-    coins,
     descend,
     fabricated_plan,
     fabricated_rollouts,
     make_store,
 )
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("learner")
-
-
-@pytest.fixture(scope="module")
-def dataset(folder: Path) -> Dataset:
-    return load_dataset(make_store(folder / "store"), TINY)
-
-
-@pytest.fixture(scope="module")
-def coin_dataset(dataset: Dataset) -> Dataset:
-    return coins(dataset)
 
 
 def fresh(dataset: Dataset, seed: int = 0, config: NetworkConfig = TINY) -> tuple[Policy, FrozenFeatures]:

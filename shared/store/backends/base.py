@@ -105,7 +105,7 @@ class StorageBackend(Protocol):
         """Remove such a file; it is no error if there is none."""
         ...
 
-    def publish(self, publication: Transaction) -> bool:
+    def publish(self, transaction: Transaction) -> bool:
         """Put a folder there unless it is there, with its mark; returns whether this call did it.
 
         Raises:

@@ -108,14 +108,14 @@ class DiskPlace:
         """See `StorageBackend.remove`."""
         self._at(key).unlink(missing_ok=True)
 
-    def publish(self, publication: Transaction) -> bool:
+    def publish(self, transaction: Transaction) -> bool:
         """See `StorageBackend.publish`."""
-        final = self._at(publication.folder)
+        final = self._at(transaction.folder)
         final.parent.mkdir(exist_ok=True)
         temporary = final.parent / temporary_name(final.name)
         try:
-            _write_files(temporary, publication.files, publication.mark, publication.describe(publication.files))
-            return self._move_into_place(temporary, final, publication)
+            _write_files(temporary, transaction.files, transaction.mark, transaction.describe(transaction.files))
+            return self._move_into_place(temporary, final, transaction)
         finally:
             # After success this name is gone; after a lost race, or an error, what lies here is of no use.
             remove_tree(temporary)
@@ -156,14 +156,14 @@ class DiskPlace:
     def _at(self, key: str) -> Path:
         return self.root / key
 
-    def _move_into_place(self, temporary: Path, final: Path, publication: Transaction) -> bool:
+    def _move_into_place(self, temporary: Path, final: Path, transaction: Transaction) -> bool:
         """Rename a finished folder to its name; False where a published one has it already."""
         folder = final.parent
         # The lock makes one step of looking at what is there and of renaming; the data were written without it.
-        with exclusive_lock(folder / f"{LOCK_PREFIX}{publication.lock}", _LOCK_WAIT_S):
-            if _mode(final / publication.mark):
+        with exclusive_lock(folder / f"{LOCK_PREFIX}{transaction.lock}", _LOCK_WAIT_S):
+            if _mode(final / transaction.mark):
                 return False
-            publication.check()
+            transaction.check()
             if _mode(final):
                 # A folder of this name without its mark: half a copy, say. Under this name a sweep may remove it.
                 remnant = folder / temporary_name(final.name)

@@ -157,18 +157,18 @@ class BucketPlace:
         except FileNotFoundError:
             return
 
-    def publish(self, publication: Transaction) -> bool:
+    def publish(self, transaction: Transaction) -> bool:
         """See `StorageBackend.publish`."""
-        folder, mark = publication.folder, f"{publication.folder}/{publication.mark}"
-        publication.check()
+        folder, mark = transaction.folder, f"{transaction.folder}/{transaction.mark}"
+        transaction.check()
 
         def put(file: tuple[str, bytes]) -> bytes:
             key = f"{folder}/{file[0]}"
             # A file of that name may be larger than ours: its rows hold wall times, which compress differently.
             return file[1] if self.create(key, file[1]) else self.read(key, 2 * len(file[1]) + (1 << 16))
 
-        held = dict(zip(publication.files, self._map(put, list(publication.files.items())), strict=True))
-        return self.create(mark, publication.describe(held))
+        held = dict(zip(transaction.files, self._map(put, list(transaction.files.items())), strict=True))
+        return self.create(mark, transaction.describe(held))
 
     def move(self, key: str, new: str) -> None:
         """See `StorageBackend.move`: everything is copied before anything goes."""
