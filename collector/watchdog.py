@@ -1,8 +1,8 @@
-"""What a process that executes rollouts owes those who depend on it: heartbeats, crash log, and bounds.
+"""Watchdog of a worker process: heartbeat, crash traceback, time and memory limits.
 
     watchdog = Watchdog(crash_log, limits)
-    guard.stand()                              # once, before anything that could crash
-    with guard.job(job) as under_way:
+    watchdog.stand()                           # once, before anything that could crash
+    with watchdog.job(job) as under_way:
         under_way(17)                          # before each rollout; None before and after them
 
 The engine is native code: it can crash, and it holds the interpreter's lock while it steps, so that no thread of Python

@@ -84,7 +84,7 @@ def collect(
             rollouts that the store holds of the plan gave no interaction.
         StoreError: the plan's policy is not in the store.
     """
-    # Only one driver works on a store, so whatever the dead left is of no use to anybody.
+    # Only one driver works on a store, so leftovers of crashed workers can be removed.
     store.sweep()
     if isinstance(plan, Plan):
         store.add_plan(plan)

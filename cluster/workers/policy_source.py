@@ -13,7 +13,7 @@ LOOK_S = 2.0
 class PolicySource:
     """The plan of one proposer at each moment; call it.
 
-    A policy proposes what is handed out until `LOOK_S` after its successor was published. What was handed out before
+    A new policy takes effect within `LOOK_S` seconds of being published. What was handed out before
     is still executed as it was: at most two jobs an actor, unless one of them fails and is tried again.
 
     Args:

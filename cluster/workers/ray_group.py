@@ -1,7 +1,7 @@
 """The worker group of Ray actors: bounded work in flight, dead and hung actors replaced, only job results coming back.
 
 What the driver does for a shard does not depend on how many actors there are: answers call back by themselves, instead
-of being looked for among all that are expected, and slots are filed by what they want (`cluster.workers.slots`).
+of being looked for among all that are expected, and slots are queued by state (`cluster.workers.slots`).
 """
 
 import logging
@@ -180,7 +180,7 @@ class RayWorkerGroup:
     def _hand_out(self, backlog: Backlog, retries: RetryPolicy) -> None:
         """Give actors that are up what they want, and call an actor for each order that has to wait.
 
-        An actor that is called may be long in coming, or for ever where a machine has left; so nothing is bound to it.
+        An actor may start late or never (its machine may be gone), so no job waits for it.
 
         Args:
             backlog: where they come from, and those that actors were called for go.

@@ -1,4 +1,4 @@
-"""Who is to blame for attempts that failed: jobs are tried again, and rollouts that fail too often are quarantined.
+"""Retries: jobs that failed are executed again, and rollouts that fail too often are quarantined.
 
 A *fault* is of the rollout's own making: its process crashed or hung, or it raised what no rollout may raise. A *loss*
 is a process that ended without a word: killed from outside, gone with its machine, or taken by the kernel for want of

@@ -1,7 +1,6 @@
-"""Slots of a worker group: a place for one actor each, what it was given to do, and who wants a job next.
+"""Slots of a worker group: each holds one actor and the jobs that it was given.
 
-Whatever happens with one job takes the same time however many slots there are: slots are filed by what they want, and
-nothing here goes through all of them.
+Slots are queued by state, so every operation takes the same time however many slots there are.
 """
 
 import time
@@ -74,7 +73,7 @@ class Slot:
 
 
 class Slots:
-    """All slots, filed by what they want; `file` one after each change."""
+    """All slots, queued by state; call `file` after each change of a slot."""
 
     def __init__(self, count: int) -> None:
         self._all = [Slot() for _ in range(count)]
@@ -104,7 +103,7 @@ class Slots:
         return next((slot for idle in self._idle for slot in idle), None)
 
     def file(self, slot: Slot) -> None:
-        """Take note of what a slot wants now."""
+        """Queue a slot by its present state."""
         for drawer in (self._empty, self._called, *self._idle):
             drawer.pop(slot, None)
         if slot.actor is None:
