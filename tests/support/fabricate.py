@@ -10,6 +10,7 @@ import hashlib
 import shutil
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -155,7 +156,7 @@ def fabricate_interaction(
     )
 
 
-def identical(one: object, other: object) -> bool:
+def identical(one: Any, other: Any) -> bool:
     """Whether two records are the same bit for bit: signs of zero, NaNs, types and shapes included."""
     if type(one) is not type(other):
         return False
@@ -165,10 +166,10 @@ def identical(one: object, other: object) -> bool:
     if isinstance(one, tuple):
         return len(one) == len(other) and all(map(identical, one, other))
     if isinstance(one, np.ndarray):
-        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+        return bool(one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes())
     if isinstance(one, float):
         return struct.pack("<d", one) == struct.pack("<d", other)
-    return one == other
+    return bool(one == other)
 
 
 def fabricate_store(path: Path, shards: int, rollouts: int = 2, points: int = 64) -> Store:
@@ -192,7 +193,7 @@ def fabricate_store(path: Path, shards: int, rollouts: int = 2, points: int = 64
         for name, source in clouds.items():
             # A file system allows only so many links of a file.
             if number % 30_000 == 0:
-                clouds[name] = shutil.copy(source, folder / name)
+                clouds[name] = Path(shutil.copy(source, folder / name))
             else:
                 (folder / name).hardlink_to(source)
         for name, data in tables.items():
