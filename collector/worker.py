@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 import psutil
@@ -21,16 +22,16 @@ from collector.stopwatch import StageClock
 from collector.watchdog import UnderWay
 from shared.io.redaction import without_places
 from shared.plan import Job, Plan
-from shared.policies.adaptation import Adapter
 from shared.policies.methods import PROPOSERS, needs_policy
-from shared.policies.policy import Policy
-from shared.policies.proposers import proposer_named
 from shared.records import RolloutRecord, RolloutStatus
 from shared.reproduction import OBJECTS, STORE, reproduction
 from shared.store import Quarantined, Store
 from shared.store.layout import MAX_REASON
 from shared.store.provenance import note_machine
 from shared.types import Proposer
+
+if TYPE_CHECKING:
+    from shared.policies.adaptation import Adapter
 
 NOTHING: Mapping[int, str] = MappingProxyType({})
 CACHED_POLICIES = 2
@@ -54,6 +55,10 @@ class Worker:
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """Take up the weights of a policy version."""
+        # Networks are imported with the first policy: PyTorch is half of a worker's start, and random rounds need none.
+        from shared.policies.adaptation import Adapter
+        from shared.policies.policy import Policy
+
         while len(self._adapters) >= CACHED_POLICIES:
             self._adapters.pop(next(iter(self._adapters)))
         self._adapters[version] = Adapter(Policy.from_files(files))
@@ -127,6 +132,8 @@ class Worker:
         """The proposer called `name`, of a policy version."""
         if name == RandomProposer.name:
             return RandomProposer(rng, plan.setting.terms.edge_share)
+        from shared.policies.proposers import proposer_named
+
         if name in PROPOSERS.names() and not needs_policy(name):
             return proposer_named(name, None, rng, plan.most_tries)
         if version not in self._adapters:
