@@ -51,6 +51,19 @@ class Joint:
 
 
 @dataclass(frozen=True, slots=True)
+class PartSummary:
+    """What a task asks of a movable part."""
+
+    name: str
+    """Semantic name; "" where semantics.txt is silent."""
+    kind: Literal["revolute", "prismatic"]
+    span: float
+    """Upper limit minus lower limit, rad or length."""
+    visible: bool
+    """Whether it has any visual mesh."""
+
+
+@dataclass(frozen=True, slots=True)
 class Body:
     """One rigid body."""
 
@@ -79,6 +92,14 @@ class ArticulatedObject:
     def parts(self) -> tuple[Body, ...]:
         """The movable bodies; part id k is `parts[k - 1]`."""
         return self.bodies[1:]
+
+    def summaries(self) -> tuple[PartSummary, ...]:
+        """What tasks ask of each part."""
+        return tuple(
+            PartSummary(body.part_name, body.joint.kind, body.joint.span, bool(body.visuals))
+            for body in self.parts
+            if body.joint is not None
+        )
 
     def limits(self) -> Float:
         """[parts, 2], lower and upper joint limits."""

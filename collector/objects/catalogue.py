@@ -4,17 +4,18 @@ A catalogue keeps a few words an object; geometry is read when it is wanted (`lo
 """
 
 import re
+import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from collector.objects.articulation import MIN_RANGE, ArticulatedObject
+from collector.objects.articulation import MIN_RANGE, ArticulatedObject, PartSummary
 from collector.objects.decomposition import Decomposer
-from collector.objects.files import short
-from collector.objects.readers import READERS, read_object, reader_of
+from collector.objects.files import ObjectFiles, short
+from collector.objects.readers import READERS, read_files, read_object, reader_of
+from collector.objects.scan_cache import Found, ScanCache
 from shared.config import Collision
 from shared.errors import ObjectError, UsageError
 from shared.io.files import read_named
@@ -25,19 +26,6 @@ from shared.tasks import Task
 
 MAX_LIST_BYTES = 1 << 20
 _OBJECT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-
-
-@dataclass(frozen=True, slots=True)
-class PartSummary:
-    """What a task asks of a movable part."""
-
-    name: str
-    """Semantic name; "" where semantics.txt is silent."""
-    kind: Literal["revolute", "prismatic"]
-    span: float
-    """Upper limit minus lower limit, rad or length."""
-    visible: bool
-    """Whether it has any visual mesh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +64,16 @@ class ObjectSplit:
     test: tuple[ObjectRef, ...]
 
 
-def scan(path: Path, *object_lists: Path) -> Catalogue:
+def scan(path: Path, *object_lists: Path, anew: bool = False) -> Catalogue:
     """Read and check every object below `path`.
+
+    An object whose files have not changed since an earlier scan is not read again. A catalogue only says what there is:
+    whoever loads an object reads its files, and compares their content.
 
     Args:
         path: a folder of object folders, or one object's folder. Files and hidden folders in it are ignored.
         object_lists: Where2Act lists, `<id> <category>` a line; where there are any, only their objects are looked at.
+        anew: read all of them, whatever is known.
 
     Raises:
         UsageError: `path` or a list cannot be read, or there is no object at all.
@@ -96,10 +88,10 @@ def scan(path: Path, *object_lists: Path) -> Catalogue:
     elif all(reader_of(folder) is None for folder in folders.values()):
         layouts = ", ".join(READERS.names())
         raise UsageError(f"{path}: holds no object; name a folder of objects ({layouts}), or one object's folder")
-    usable, refused = [], []
+    usable, refused, cache = [], [], ScanCache(cache_folder("objects"))
     for object_id in sorted(folders):
         try:
-            usable.append(_entry(folders[object_id], path))
+            usable.append(_entry(folders[object_id], path, cache, anew))
         except ObjectError as error:
             refused.append((object_id, str(error)))
     return Catalogue(tuple(usable), tuple(refused))
@@ -170,7 +162,7 @@ def qualifying_parts(described: CatalogueEntry | ArticulatedObject, task: Task) 
     """The parts (1-based) that `task` may act on: visible, able to move, and of the kind that it names."""
     if task.categories and described.ref.category not in task.categories:
         return ()
-    parts = described.parts if isinstance(described, CatalogueEntry) else summaries(described)
+    parts = described.parts if isinstance(described, CatalogueEntry) else described.summaries()
     return tuple(number for number, part in enumerate(parts, start=1) if _qualifies(part, task))
 
 
@@ -204,15 +196,6 @@ def split(refs: Iterable[ObjectRef], fractions: tuple[float, float, float], seed
     return ObjectSplit(train, validation, test)
 
 
-def summaries(described: ArticulatedObject) -> tuple[PartSummary, ...]:
-    """What tasks ask of each part of an object."""
-    return tuple(
-        PartSummary(body.part_name, body.joint.kind, body.joint.span, bool(body.visuals))
-        for body in described.parts
-        if body.joint is not None
-    )
-
-
 def _object_folders(path: Path) -> dict[str, Path]:
     """Object folders by id."""
     if not path.is_dir():
@@ -225,9 +208,14 @@ def _object_folders(path: Path) -> dict[str, Path]:
         raise UsageError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _entry(folder: Path, tree: Path) -> CatalogueEntry:
-    described = read_object(folder, tree)
-    return CatalogueEntry(described.ref, folder, summaries(described), tree, described.notes)
+def _entry(folder: Path, tree: Path, cache: ScanCache, anew: bool) -> CatalogueEntry:
+    found = None if anew else cache.get(folder, tree)
+    if found is None:
+        begun, files = time.time_ns(), ObjectFiles(folder, tree)
+        described = read_files(files)
+        found = Found(ref=described.ref, parts=described.summaries(), notes=described.notes)
+        cache.keep(folder, tree, found, files.asked, begun)
+    return CatalogueEntry(found.ref, folder, found.parts, tree, found.notes)
 
 
 def _load(folder: Path, tree: Path, ref: ObjectRef) -> ArticulatedObject:

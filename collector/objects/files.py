@@ -58,6 +58,8 @@ class ObjectFiles:
         # What an object brings along is not trusted to be a cache.
         within = top.parents if top == own else (top, *top.parents)
         self._read_so_far: dict[str, bytes] = {}
+        self.asked: set[str] = set()
+        """Names that anything was asked of: what the object is depends on these files, and on their being there."""
         self._roots = (own, top, *(cache for above in within for cache in _caches(above, top)))
 
     def exists(self, name: str) -> bool:
@@ -129,6 +131,7 @@ class ObjectFiles:
         relative = Path(name)
         if not name or "\0" in name or "\\" in name or relative.is_absolute() or ".." in relative.parts:
             raise ObjectError(f"{self.folder}: {short(name)} is not a plain path below the object's folder")
+        self.asked.add(name)
         return self.folder / relative
 
 

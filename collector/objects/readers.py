@@ -77,7 +77,12 @@ def read_object(folder: Path, tree: Path | None = None) -> ArticulatedObject:
     Raises:
         ObjectError: with one line that says what is wrong with the object's files.
     """
-    files = ObjectFiles(folder, tree)
+    return read_files(ObjectFiles(folder, tree))
+
+
+def read_files(files: ObjectFiles) -> ArticulatedObject:
+    """The object in the folder of `files`; raises as `read_object` does."""
+    folder = files.folder
     # The first reader says what is missing in a folder that has no layout at all.
     name = reader_of(folder) or READERS.names()[0]
     described = READERS.get(name).read(files)

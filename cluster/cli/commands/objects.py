@@ -99,7 +99,7 @@ def _check(command: CheckCommand) -> int:
     from shared.tasks import task_of
 
     lists = () if command.object_list is None else (command.object_list,)
-    catalogue = of_categories(scan(command.path, *lists), expanded(command.categories))
+    catalogue = of_categories(scan(command.path, *lists, anew=True), expanded(command.categories))
     if command.task is not None:
         catalogue = for_task(catalogue, task_of(command.task))
     described = {object_id: f"refused: {reason}" for object_id, reason in catalogue.refused}
