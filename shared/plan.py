@@ -91,6 +91,11 @@ class Setting(StrictModel):
         return self.collection.dynamics or self.terms.dynamics
 
     @property
+    def primitive(self) -> str:
+        """What interactions execute; the task is looked up as for `dynamics`."""
+        return self.collection.primitive or self.terms.primitive
+
+    @property
     def terms(self) -> Terms:
         """What holds, whether `collection` says it or leaves it to the task.
 

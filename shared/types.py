@@ -53,6 +53,11 @@ class OutcomeKind(StrEnum):
         """Whether a learner may use the row."""
         return self is not OutcomeKind.ABANDONED
 
+    @property
+    def is_valid(self) -> bool:
+        """Whether the primitive ran to its end: what it closed its fingers on was held, and no contact was refused."""
+        return self in (OutcomeKind.OK, OutcomeKind.NO_CONTACT)
+
 
 class Direction(StrEnum):
     """Which ways a joint turns from where it starts; hidden from view ("pushing faucet" in the paper)."""

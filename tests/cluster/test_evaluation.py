@@ -76,6 +76,8 @@ def table_of(**values: object) -> EvaluationTable:
         **{"sample_success": None, "sample_success_low": None, "sample_success_high": None, "trials": 0},
         **{"start_success": 0.4, "start_success_low": 0.2, "start_success_high": 0.6, "counts": {"object": ["a"]}},
         **{"best_f": 0.6, "bce": 0.5, "auc": None, "base_rate": 0.3, "mean_tries": 2.0, "gap_closed": None},
+        **{"mix_f_score": 0.8, "mix_f_score_low": 0.7, "mix_f_score_high": 0.9, "mix_base_rate": 0.45},
+        **{"shifted_f_score": None, "shifted_f_score_low": None, "shifted_f_score_high": None},
     }
     return EvaluationTable("push-faucet", 1, 4, 40, 2, "ab" * 32, {"a": "cd" * 32}, (row | values,))
 
@@ -83,7 +85,9 @@ def table_of(**values: object) -> EvaluationTable:
 def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     shown = as_markdown(table_of())
     assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | 40.0 [20.0, 60.0] | - | 0 |" in shown
+    assert "2 | 80.0 [70.0, 90.0] | - |" in shown
     assert "30.0% succeed" in shown
+    assert "of which 45.0% succeed" in shown
     read = list(csv.DictReader(io.StringIO(csv_table(table_of().rows, ["counts"]))))
     assert (read[0]["f_score"], read[0]["auc"]) == ("0.5", "")
     assert "counts" not in read[0]
