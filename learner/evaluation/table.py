@@ -199,7 +199,7 @@ def evaluate(
 ) -> list[EvaluationRow]:
     """One row for each method and budget that there are rows of.
 
-    Where2Act, AAP with no tries and the oracle, where there is one, have a row of their own at budget 0.
+    Where2Act, AAP with no tries and the oracle, where they are trained, have a row of their own at budget 0.
 
     Args:
         dataset: the interactions.
@@ -212,14 +212,13 @@ def evaluate(
         StoreError: there is no QUERY row, or the data set is of a task with another primitive than a policy's.
     """
     for policy in policies.values():
-        if policy.task != dataset.task and _primitive(policy.task) != _primitive(dataset.task):
+        if policy.task != dataset.task and _primitive(policy.task) not in (None, dataset.primitive):
             raise StoreError(f"the store is of task '{dataset.task}', but a policy of '{policy.task}'")
         policy.modules().eval()
     judge = _Judge(dataset, policies)
-    rows = [
-        judge.row(PRIOR_METHOD, 0, judge.critic("where2act", version)),
-        judge.row(NO_TRIES_METHOD, 0, judge.critic("aap", version)),
-    ]
+    rows = [judge.row(PRIOR_METHOD, 0, judge.critic("where2act", version))]
+    if "aap" in policies[version].trained:
+        rows.append(judge.row(NO_TRIES_METHOD, 0, judge.critic("aap", version)))
     if oracle is not None:
         rows.append(judge.row(ORACLE_METHOD, 0, OracleScores(oracle.eval(), judge.known)))
     for name in _methods(dataset):
