@@ -21,6 +21,9 @@ class EvaluateSettings(ObjectSelection):
     """Trials an object: each draws hidden dynamics and a camera, tries and acts anew. As published: 10."""
     queries: int = Field(24, ge=1, le=10_000)
     """Random test interactions a trial, which critics are asked about (F-score)."""
+    exploit_share: float | None = Field(None, gt=0, le=1)
+    """Also act at a point drawn from the best points of the cloud, this share of it, and let AIP draw so; as published:
+    0.01. Adds the column "sample-success, best share"."""
     policy_version: int | None = Field(None, ge=1)
     """Of a run: which of its policies; the last where none is named."""
     collection: CollectionConfig = CollectionConfig()

@@ -15,6 +15,7 @@ STANDS_BESIDE: Mapping[str, str] = {
     **{measure: measure for measure in PUBLISHED_MEASURES},
     "mix_f_score": "f_score",
     "shifted_f_score": "f_score",
+    "share_success": "sample_success",
 }
 """Which of them each of our measures is compared with; the others have none."""
 

@@ -172,6 +172,7 @@ def _evaluate(
             methods=tuple(dict.fromkeys(settings.methods)) or subject.methods,
             budgets=tuple(sorted(set(settings.budgets))),
             queries=settings.queries,
+            exploit_share=settings.exploit_share,
         ),
     )
     out = out if out is not None else _default_out(subject, setting, folder)

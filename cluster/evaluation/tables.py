@@ -6,7 +6,7 @@ again leaves the same bytes.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from shared.policies.methods import METHODS, MethodName
 
 RESULTS_FILE, CSV_FILE, MARKDOWN_FILE = "results.json", "table.csv", "table.md"
 
-Measure = Literal["f_score", "sample_success", "start_success", "mix_f_score", "shifted_f_score"]
+Measure = Literal["f_score", "sample_success", "start_success", "mix_f_score", "shifted_f_score", "share_success"]
 MEASURES: Mapping[Measure, str] = {
     "f_score": "F-score",
     "sample_success": "sample-success",
@@ -31,6 +31,7 @@ MEASURES: Mapping[Measure, str] = {
 LIKE_FOR_LIKE: Mapping[Measure, str] = {
     "mix_f_score": "F, published mix",
     "shifted_f_score": "F, published mix, shifted",
+    "share_success": "sample-success, best share",
 }
 """The same measured as the paper did, so that absolute figures can be compared with its (docs/evaluation.md)."""
 _SHOWN: Mapping[str, str] = {
@@ -79,6 +80,9 @@ class ResultRow(BaseModel):
     shifted_f_score: float | None = None
     shifted_f_score_low: float | None = None
     shifted_f_score_high: float | None = None
+    share_success: float | None = None
+    share_success_low: float | None = None
+    share_success_high: float | None = None
     mix_base_rate: float | None = None
     trials: int
     gap_closed: float | None = None
@@ -151,6 +155,8 @@ def write_tables(out: Path, table: EvaluationTable) -> None:
 
 def as_markdown(table: EvaluationTable) -> str:
     """The table as the paper has it, with 95% intervals; percent where the paper has percent."""
+    measured = [name for name in LIKE_FOR_LIKE if any(row[name] is not None for row in table.rows)]
+    shown = {name: title for name, title in _SHOWN.items() if name in measured or name not in LIKE_FOR_LIKE}
     natural, published = (next((row[name] for row in table.rows), None) for name in ("base_rate", "mix_base_rate"))
     lines = [
         f"# {markdown(table.task)}",
@@ -159,19 +165,31 @@ def as_markdown(table: EvaluationTable) -> str:
         f"F-score at threshold 0.5 on random interactions, of which {percent(natural)}% succeed. In brackets: 95% "
         "bootstrap intervals over objects. Sample-success: where the tries left the object, as in the paper; from the "
         "start: where they began. Gap closed: of that in F-score between Where2Act and the oracle, which is told the "
-        f"hidden facts. {like_for_like_note(published)} Digest of the interactions: `{table.store_digest[:16]}`.",
+        f"hidden facts. {like_for_like_note(published, measured)} Digest of the interactions: "
+        f"`{table.store_digest[:16]}`.",
         "",
-        *markdown_table(list(_SHOWN.values()), ([_cell(row, name) for name in _SHOWN] for row in table.rows)),
+        *markdown_table(list(shown.values()), ([_cell(row, name) for name in shown] for row in table.rows)),
     ]
     return "\n".join(lines) + "\n"
 
 
-def like_for_like_note(base_rate: float | None) -> str:
-    """What the like-for-like columns are, in a sentence or two; `base_rate`: of success in the published mix."""
-    return (
+def like_for_like_note(base_rate: float | None, measured: Collection[Measure]) -> str:
+    """What the like-for-like columns are, in a few sentences.
+
+    Args:
+        base_rate: of success in the published mix.
+        measured: which of `LIKE_FOR_LIKE` there are figures of.
+    """
+    note = (
         "Published mix: the same questions, weighted as the paper's test rollouts were topped up by label, of which "
         f"{percent(base_rate)}% succeed; shifted: with logits moved by the change of the base rate."
     )
+    if "share_success" in measured:
+        note += (
+            " Best share: the points of actions and of AIP's tries are drawn from the best share of the cloud, as "
+            "published, and the action is executed where the tries began."
+        )
+    return note
 
 
 def _cell(row: Mapping[str, Any], name: str) -> str:

@@ -328,8 +328,8 @@ def _like_for_like(rows: Sequence[PooledRow]) -> list[str]:
         head += [LIKE_FOR_LIKE[name], "paper"]
         for row, of_row in zip(rows, cells, strict=True):
             of_row += [_with_limits(row.shares[name]), _of_paper(row.paper[STANDS_BESIDE[name]])]
-    note = f"Like for like with the paper. {like_for_like_note(rows[0].averages['mix_base_rate'])}"
-    return [note, "", *markdown_table(head, cells), ""]
+    note = like_for_like_note(rows[0].averages["mix_base_rate"], measured)
+    return [f"Like for like with the paper. {note}", "", *markdown_table(head, cells), ""]
 
 
 def _by_run(row: PooledRow) -> list[str]:

@@ -148,7 +148,7 @@ def like_for_like(results: Results) -> tuple[Table, ...]:
     if not measured:
         return ()
     base_rate = next((row.mix_base_rate for row in results.rows), None)
-    return (table_of(results, f"Like for like with the paper. {like_for_like_note(base_rate)}", measured),)
+    return (table_of(results, f"Like for like with the paper. {like_for_like_note(base_rate, measured)}", measured),)
 
 
 def table_of(results: Results, caption: str = "", measures: Mapping[Measure, str] = MEASURES) -> Table:

@@ -34,7 +34,7 @@ NO_TRIES_METHOD = "aap-no-tries"
 ORACLE_METHOD = "oracle"
 """A critic that is told the hidden facts: the bound of what tries can teach. It acts on nothing, so has no exploits."""
 
-SHARES = ("f_score", "sample_success", "start_success", "mix_f_score", "shifted_f_score")
+SHARES = ("f_score", "sample_success", "start_success", "mix_f_score", "shifted_f_score", "share_success")
 """Figures that follow from counts by object, so that they have intervals over objects and can be pooled."""
 
 
@@ -58,6 +58,8 @@ class ObjectCounts:
         mix_hits: those that both hold of.
         shifted_claimed: as `mix_claimed`, after the shift of the base rate.
         shifted_hits: those that both hold of.
+        share_trials: EXPLOIT_BY_SHARE rows; empty where the evaluation executes none.
+        share_successes: those that succeeded.
     """
 
     object: tuple[str, ...]
@@ -74,6 +76,8 @@ class ObjectCounts:
     mix_hits: tuple[float, ...] = ()
     shifted_claimed: tuple[float, ...] = ()
     shifted_hits: tuple[float, ...] = ()
+    share_trials: tuple[int, ...] = ()
+    share_successes: tuple[int, ...] = ()
 
     def f_score(self) -> tuple[float, float, float]:
         """F1 = 2 hits / (claimed + true), and its 95% interval over objects; NaN where nothing is claimed or true."""
@@ -94,6 +98,10 @@ class ObjectCounts:
     def shifted_f_score(self) -> tuple[float, float, float]:
         """The same after the shift of the base rate."""
         return _ratio(2 * np.array(self.shifted_hits), np.add(self.shifted_claimed, self.mix_true), self.mix_true)
+
+    def share_success(self) -> tuple[float, float, float]:
+        """The share of EXPLOIT_BY_SHARE rows that succeeded, and its 95% interval over objects; NaN where none are."""
+        return _ratio(self.share_successes, self.share_trials, self.share_trials)
 
     def shares(self) -> dict[str, float]:
         """All of these by name, and where their intervals begin and end."""
@@ -134,6 +142,9 @@ class EvaluationRow:
         shifted_f_score: the same after logits are shifted by logit(`mix_base_rate`) - logit(`base_rate`).
         shifted_f_score_low: where its 95% interval over objects begins.
         shifted_f_score_high: where it ends.
+        share_success: share of the EXPLOIT_BY_SHARE rows that succeeded.
+        share_success_low: where its 95% interval over objects begins.
+        share_success_high: where it ends.
         mix_base_rate: share of successes in the published mix of rows.
         counts: what these are of, by object.
     """
@@ -163,6 +174,9 @@ class EvaluationRow:
     shifted_f_score: float
     shifted_f_score_low: float
     shifted_f_score_high: float
+    share_success: float
+    share_success_low: float
+    share_success_high: float
     mix_base_rate: float
     counts: ObjectCounts
 
@@ -312,6 +326,8 @@ class _Judge:
         asked, true, success = self._asked, self._true, self._success
         chosen = self._exploits(Role.EXPLOIT, method, budget)
         at_start = chosen if method == PRIOR_METHOD else self._exploits(Role.EXPLOIT_AT_START, method, budget)
+        by_share = self._exploits(Role.EXPLOIT_BY_SHARE, method, budget)
+        executed = Role.EXPLOIT_BY_SHARE.value in self.dataset.rows.role
 
         def of_objects(rows: NDArray[np.int64]) -> tuple[int, ...]:
             return tuple(np.bincount(self._object_of[rows], minlength=len(self._names)).tolist())
@@ -335,6 +351,8 @@ class _Judge:
             mix_hits=published_rows(claimed & true),
             shifted_claimed=published_rows(shifted),
             shifted_hits=published_rows(shifted & true),
+            share_trials=of_objects(by_share) if executed else (),
+            share_successes=of_objects(by_share[success[by_share]]) if executed else (),
         )
 
     def _context(self, index: Tensor, method: str, budget: int) -> Tensor:

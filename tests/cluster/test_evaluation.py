@@ -81,6 +81,7 @@ def table_of(**values: object) -> EvaluationTable:
         **{"best_f": 0.6, "bce": 0.5, "auc": None, "base_rate": 0.3, "mean_tries": 2.0, "gap_closed": None},
         **{"mix_f_score": 0.8, "mix_f_score_low": 0.7, "mix_f_score_high": 0.9, "mix_base_rate": 0.45},
         **{"shifted_f_score": None, "shifted_f_score_low": None, "shifted_f_score_high": None},
+        **{"share_success": None, "share_success_low": None, "share_success_high": None},
     }
     return EvaluationTable("push-faucet", 1, 4, 40, 2, "ab" * 32, {"a": "cd" * 32}, (row | values,))
 
@@ -88,7 +89,11 @@ def table_of(**values: object) -> EvaluationTable:
 def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     shown = as_markdown(table_of())
     assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | 40.0 [20.0, 60.0] | - | 0 |" in shown
-    assert "2 | 80.0 [70.0, 90.0] | - |" in shown
+    assert "| 2 | 80.0 [70.0, 90.0] |\n" in shown  # Like-for-like columns stand last, where there are figures.
+    assert "best share" not in shown.lower()
+    both = as_markdown(table_of(share_success=0.25, share_success_low=0.1, share_success_high=0.5))
+    assert "| 80.0 [70.0, 90.0] | 25.0 [10.0, 50.0] |\n" in both
+    assert "Best share: the points of actions" in both
     assert "30.0% succeed" in shown
     assert "of which 45.0% succeed" in shown
     read = list(csv.DictReader(io.StringIO(csv_table(table_of().rows, ["counts"]))))
@@ -177,6 +182,7 @@ def test_what_does_not_suit_is_refused_in_one_line(
         (["--run", str(finished), "--task", "pull"], "the policy is trained to push"),
         (["--run", str(finished), "--collection.camera.points", "99"], "--collection settings are for --policy"),
         (["--run", str(finished), "--budgets", "0"], "budgets"),
+        (["--run", str(finished), "--exploit-share", "0"], "exploit_share"),
         (["--run", str(finished), "--task", "pusk"], "unknown task 'pusk'"),
         (["--run", str(finished), "--objects", str(tmp_path / "boxes")], "suits the task 'push-faucet'"),
     ):
@@ -299,7 +305,7 @@ def test_evaluate_policy_without_run_writes_the_table_and_never_mixes_policies(
     finished: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = ["--objects", str(finished / "objects"), "--methods", "where2act", "--budgets", "1", "--trials", "1"]
-    flags += ["--queries", "2", "--workers", "0", "--out", str(tmp_path / "out")]
+    flags += ["--exploit-share", "0.01", "--queries", "2", "--workers", "0", "--out", str(tmp_path / "out")]
     flags += ["--collection.camera.points", "256", "--collection.camera.image-size", "128"]
     assert adaafford(["evaluate", "--policy", str(exported), *flags]) == 0
     assert "| where2act | 1 |" in capsys.readouterr().out
@@ -307,6 +313,9 @@ def test_evaluate_policy_without_run_writes_the_table_and_never_mixes_policies(
     assert found["rollouts"] == found["objects"] == 3
     assert {row["method"] for row in found["rows"]} == {"where2act", "aap-no-tries"}  # No oracle came along.
     assert all("mix_f_score" in row and "shifted_f_score_low" in row for row in found["rows"])
+    shares = {row["method"]: row["share_success"] for row in found["rows"]}
+    assert shares["where2act"] is not None
+    assert shares["aap-no-tries"] is None
     other = tmp_path / "other"
     shutil.copytree(exported, other)
     policy = Policy.untrained("push-faucet", SMALL_NETWORK, seed=8).with_trained("prior").with_trained("aap")
