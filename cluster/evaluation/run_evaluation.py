@@ -79,10 +79,9 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
     policy = Policy.from_files(policies.read_policy(version))
     trained = config.task_record
     task = _task(trained, trained.terms(config.collection).primitive, settings, config.collection)
-    own = run.objects_folder()
     if settings.objects is None:
         tested = frozenset(used.test)
-        refs, folder = _objects(task, settings, own, tested.__contains__)
+        refs, folder = _objects(task, settings, run.objects_folder(), tested.__contains__)
     else:
         # By content: the same object may lie in two folders, under two names.
         seen = seen_by(str(run.path))

@@ -6,7 +6,7 @@ again leaves the same bytes.
 
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -111,6 +111,7 @@ class ResultRows(BaseModel):
 
     task: str = Field("", max_length=100)
     objects: int = Field(ge=0)
+    exploit_share: float | None = None
     rows: tuple[ResultRow, ...]
 
 
@@ -124,6 +125,7 @@ class EvaluationTable:
         objects: how many there were trials of.
         rollouts: how many trials in all; each fills the interactions anew for every method.
         policy_version: of the policy that was evaluated.
+        exploit_share: of a cloud's points, see `shared.plan.EvaluationConfig`.
         store_digest: of the interactions that the figures are of.
         contents: of these objects, SHA-256 by id, since runs call other objects the same.
         rows: a row for each method and budget: the fields of `learner.evaluation.table.EvaluationRow` ("best_f" for
@@ -135,6 +137,7 @@ class EvaluationTable:
     objects: int
     rollouts: int
     policy_version: int
+    exploit_share: float | None
     store_digest: str
     contents: Mapping[str, str]
     rows: tuple[Mapping[str, Any], ...]
@@ -165,7 +168,7 @@ def as_markdown(table: EvaluationTable) -> str:
         f"F-score at threshold 0.5 on random interactions, of which {percent(natural)}% succeed. In brackets: 95% "
         "bootstrap intervals over objects. Sample-success: where the tries left the object, as in the paper; from the "
         "start: where they began. Gap closed: of that in F-score between Where2Act and the oracle, which is told the "
-        f"hidden facts. {like_for_like_note(published, measured)} Digest of the interactions: "
+        f"hidden facts. {like_for_like_note(published, table.exploit_share)} Digest of the interactions: "
         f"`{table.store_digest[:16]}`.",
         "",
         *markdown_table(list(shown.values()), ([_cell(row, name) for name in shown] for row in table.rows)),
@@ -173,21 +176,21 @@ def as_markdown(table: EvaluationTable) -> str:
     return "\n".join(lines) + "\n"
 
 
-def like_for_like_note(base_rate: float | None, measured: Collection[Measure]) -> str:
+def like_for_like_note(base_rate: float | None, share: float | None) -> str:
     """What the like-for-like columns are, in a few sentences.
 
     Args:
         base_rate: of success in the published mix.
-        measured: which of `LIKE_FOR_LIKE` there are figures of.
+        share: of a cloud's points, from which actions by share were drawn; None: there were none.
     """
     note = (
         "Published mix: the same questions, weighted as the paper's test rollouts were topped up by label, of which "
         f"{percent(base_rate)}% succeed; shifted: with logits moved by the change of the base rate."
     )
-    if "share_success" in measured:
+    if share is not None:
         note += (
-            " Best share: the points of actions and of AIP's tries are drawn from the best share of the cloud, as "
-            "published, and the action is executed where the tries began."
+            f" Best share: the points of actions and of AIP's tries are drawn from the best {100 * share:g}% of the "
+            "cloud (published: 1%), and the action is executed where the tries began."
         )
     return note
 

@@ -130,6 +130,7 @@ class Comparison:
         objects: different objects that were tested on.
         novel_categories: whether nothing was trained on any of their categories.
         base_rate: of success among random interactions, mean over runs.
+        exploit_share: of a cloud's points, from which actions by share were drawn; None: not in all runs.
         rows: in the order of the paper's tables.
     """
 
@@ -139,6 +140,7 @@ class Comparison:
     objects: int
     novel_categories: bool
     base_rate: float
+    exploit_share: float | None
     rows: tuple[PooledRow, ...]
 
 
@@ -168,6 +170,10 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         raise UsageError("only some of the runs were tested on novel categories; compare them apart")
     if len(tasks := sorted({each.task for each in results})) > 1:
         raise UsageError(f"the runs are of different tasks ({', '.join(tasks)}); give runs of one task")
+    shares = {each.exploit_share for each in results}
+    if len(shares - {None}) > 1:
+        given = ", ".join(f"{share:g}" for share in sorted(share for share in shares if share is not None))
+        raise UsageError(f"the runs were evaluated with different exploit_share ({given}); compare them apart")
     common = set.intersection(*({(row.method, row.budget) for row in each.rows} for each in results))
     if not common:
         raise UsageError("the runs share no method and budget; evaluate them alike")
@@ -181,6 +187,7 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         objects=len({each.contents.get(name, name) for each in results for name in each.rows[0].counts.object}),
         novel_categories=novel,
         base_rate=rows[0].averages["base_rate"],
+        exploit_share=None if None in shares else next(iter(shares)),
         rows=tuple(replace(row, gap_closed=share_of_gap(prior, row.shares["f_score"][0], oracle)) for row in rows),
     )
 
@@ -291,7 +298,7 @@ def as_markdown(comparison: Comparison) -> str:
         "",
         *markdown_table(COLUMNS, map(_cells, comparison.rows)),
         "",
-        *_like_for_like(comparison.rows),
+        *_like_for_like(comparison),
         "Run by run (F-score / sample-success / from the start):",
         "",
         *markdown_table(
@@ -318,8 +325,9 @@ def _cells(row: PooledRow) -> list[str]:
     ]
 
 
-def _like_for_like(rows: Sequence[PooledRow]) -> list[str]:
+def _like_for_like(comparison: Comparison) -> list[str]:
     """A table of what was measured as in the paper, and an empty line; none where a run is of an older version."""
+    rows = comparison.rows
     measured = [name for name in LIKE_FOR_LIKE if not all(math.isnan(row.shares[name][0]) for row in rows)]
     if not measured:
         return []
@@ -328,7 +336,7 @@ def _like_for_like(rows: Sequence[PooledRow]) -> list[str]:
         head += [LIKE_FOR_LIKE[name], "paper"]
         for row, of_row in zip(rows, cells, strict=True):
             of_row += [_with_limits(row.shares[name]), _of_paper(row.paper[STANDS_BESIDE[name]])]
-    note = like_for_like_note(rows[0].averages["mix_base_rate"], measured)
+    note = like_for_like_note(rows[0].averages["mix_base_rate"], comparison.exploit_share)
     return [f"Like for like with the paper. {note}", "", *markdown_table(head, cells), ""]
 
 

@@ -36,12 +36,14 @@ class Results:
         rows: a method and a budget each.
         novel_categories: whether the test objects are of categories that nothing was trained on.
         objects: how many there were trials of.
+        exploit_share: of a cloud's points, see `shared.plan.EvaluationConfig`.
     """
 
     task: str
     rows: tuple[ResultRow, ...]
     novel_categories: bool = False
     objects: int = 0
+    exploit_share: float | None = None
 
     @property
     def budgets(self) -> list[int]:
@@ -90,7 +92,7 @@ def read_results(path: Path, task: str = "", *, novel_categories: bool = False) 
         UsageError: it does not hold results.
     """
     read = parse(ResultRows, read_json(path), str(path))
-    return Results(read.task or task, read.rows, novel_categories, read.objects)
+    return Results(read.task or task, read.rows, novel_categories, read.objects, read.exploit_share)
 
 
 def results_section(results: Results) -> Section:
@@ -148,7 +150,8 @@ def like_for_like(results: Results) -> tuple[Table, ...]:
     if not measured:
         return ()
     base_rate = next((row.mix_base_rate for row in results.rows), None)
-    return (table_of(results, f"Like for like with the paper. {like_for_like_note(base_rate, measured)}", measured),)
+    note = like_for_like_note(base_rate, results.exploit_share)
+    return (table_of(results, f"Like for like with the paper. {note}", measured),)
 
 
 def table_of(results: Results, caption: str = "", measures: Mapping[Measure, str] = MEASURES) -> Table:

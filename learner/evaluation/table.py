@@ -226,7 +226,8 @@ def evaluate(
         StoreError: there is no QUERY row, or the data set is of a task with another primitive than a policy's.
     """
     for policy in policies.values():
-        if policy.task != dataset.task and _primitive(policy.task) not in (None, dataset.primitive):
+        primitive = _primitive(dataset.task) or dataset.primitive
+        if policy.task != dataset.task and _primitive(policy.task) not in (None, primitive):
             raise StoreError(f"the store is of task '{dataset.task}', but a policy of '{policy.task}'")
         policy.modules().eval()
     judge = _Judge(dataset, policies)

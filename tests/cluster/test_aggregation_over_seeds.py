@@ -152,6 +152,29 @@ def test_results_of_older_versions_are_pooled_without_the_published_mix(
     assert json.loads((tmp_path / "out" / JSON_FILE).read_bytes())["rows"][1]["mix_f_score"] is None
 
 
+def test_exploits_by_share_are_pooled_where_all_runs_have_the_same_share(
+    runs: tuple[list[Path], object],
+) -> None:
+    def tell(run: Path, share: float | None, counted: dict[str, list[int]]) -> None:
+        path = run / "training" / "evaluate" / RESULTS_FILE
+        document = json.loads(path.read_bytes()) | {"exploit_share": share}
+        for row in document["rows"]:
+            row["counts"] |= counted
+        path.write_text(json.dumps(document))
+
+    one, two = runs[0]
+    counted = {"share_trials": [4, 4], "share_successes": [1, 2]}
+    tell(one, 0.01, counted)
+    assert np.isnan(pool(runs[0], None).rows[1].shares["share_success"][0])
+    tell(two, 0.01, counted)
+    found = pool(runs[0], None)
+    assert found.rows[1].shares["share_success"][0] == pytest.approx(6 / 16)
+    assert "drawn from the best 1% of the cloud" in as_markdown(found)
+    tell(two, 0.05, counted)
+    with pytest.raises(UsageError, match=r"different exploit_share \(0\.01, 0\.05\)"):
+        pool(runs[0], None)
+
+
 def test_novel_categories_stand_beside_the_papers_figures_of_such(tmp_path: Path) -> None:
     for trained_on, figure in (("Door", "*77.6*"), ("Faucet", "*72.8*")):
         path = tmp_path / trained_on

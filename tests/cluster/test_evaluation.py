@@ -83,7 +83,8 @@ def table_of(**values: object) -> EvaluationTable:
         **{"shifted_f_score": None, "shifted_f_score_low": None, "shifted_f_score_high": None},
         **{"share_success": None, "share_success_low": None, "share_success_high": None},
     }
-    return EvaluationTable("push-faucet", 1, 4, 40, 2, "ab" * 32, {"a": "cd" * 32}, (row | values,))
+    share = 0.01 if "share_success" in values else None
+    return EvaluationTable("push-faucet", 1, 4, 40, 2, share, "ab" * 32, {"a": "cd" * 32}, (row | values,))
 
 
 def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
@@ -93,7 +94,7 @@ def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     assert "best share" not in shown.lower()
     both = as_markdown(table_of(share_success=0.25, share_success_low=0.1, share_success_high=0.5))
     assert "| 80.0 [70.0, 90.0] | 25.0 [10.0, 50.0] |\n" in both
-    assert "Best share: the points of actions" in both
+    assert "drawn from the best 1% of the cloud" in both
     assert "30.0% succeed" in shown
     assert "of which 45.0% succeed" in shown
     read = list(csv.DictReader(io.StringIO(csv_table(table_of().rows, ["counts"]))))
