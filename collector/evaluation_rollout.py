@@ -4,9 +4,13 @@ Every method starts from the same state. Its tries continue one another; after e
 affordance chooses is executed from where the tries left the object (as in the paper), and undone. Tries that leave an
 object in the middle of its range, where it can be moved either way, make that easy whatever they taught; so another
 action is chosen and executed where all methods began.
+
+With a share of points (`EvaluationConfig.exploit_share`) every method acts once more at each budget as in the published
+code, where all methods began. These rows come last and draw from random generators of their own, so that all other rows
+are the same to the last bit with and without them.
 """
 
-from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
@@ -14,11 +18,23 @@ from collector.random_proposer import RandomProposer
 from collector.recorder import Recorder
 from shared import seeds
 from shared.plan import Plan
-from shared.policies.methods import method_named
+from shared.policies.methods import MethodName, method_named
 from shared.types import Float, Interaction, Proposer, Role
 
-ProposerFactory = Callable[[str, np.random.Generator, int], Proposer]
-"""Makes the proposer of a name, such as "aip", with its own randomness, of a policy version."""
+
+class ProposerFactory(Protocol):
+    """Makes proposers."""
+
+    def __call__(self, name: str, rng: np.random.Generator, version: int, share: float | None = None, /) -> Proposer:
+        """The proposer of a name, such as "aip", with its own randomness, of a policy version.
+
+        Args:
+            name: of the proposer.
+            rng: its own randomness.
+            version: of the policy.
+            share: of a cloud's points, from which it draws its points, as far as it draws any; None: its own way.
+        """
+        ...
 
 
 def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: ProposerFactory) -> None:
@@ -42,6 +58,7 @@ def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: Proposer
     recorder.interact(RandomProposer(rng("queries"), edge_share), config.queries, Role.QUERY, start=start)
     if recorder.sound:
         environment.restore(start)
+    tried: dict[MethodName, list[Interaction]] = {}
     for name in config.methods:
         if not recorder.sound:
             return
@@ -55,7 +72,29 @@ def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: Proposer
             context = RandomProposer(rng(f"context/{name}"), edge_share)
         elif method.tries is not None:
             context = make_proposer(method.tries, rng(f"context/{name}"), version)
-        _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), start)
+        tried[name] = _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), start)
+    for name, history in tried.items() if config.exploit_share is not None else ():
+        method = method_named(name)
+        version = method.policy_version(plan.policy_version)
+        recorder.policy_version = version
+        if method.draws_tries and recorder.sound:
+            environment.restore(start)
+            context = make_proposer(str(method.tries), rng(f"context-by-share/{name}"), version, config.exploit_share)
+            most = method.budgets(config.budgets)[-1]
+            history = recorder.interact(context, most, Role.CONTEXT_BY_SHARE, method=name)
+        exploiter = make_proposer(method.critic, rng(f"exploit-by-share/{name}"), version, config.exploit_share)
+        _exploit_by_share(recorder, name, history, exploiter, method.budgets(config.budgets), start)
+
+
+def _exploit_by_share(
+    recorder: Recorder, method: str, tried: list[Interaction], exploiter: Proposer, budgets: list[int], start: Float
+) -> None:
+    """At each budget, execute what the method would do after its first tries, where they began."""
+    for budget in budgets:
+        if not recorder.sound:
+            return
+        known, role = tried[:budget], Role.EXPLOIT_BY_SHARE
+        recorder.interact(exploiter, 1, role, history=known, start=start, method=method, budget=budget)
 
 
 def _adapt(
@@ -65,19 +104,24 @@ def _adapt(
     exploiter: Proposer,
     budgets: list[int],
     start: Float,
-) -> None:
-    """Fill the set of interactions one try at a time; at each budget, execute what the method would do, and undo it."""
+) -> list[Interaction]:
+    """Fill the set of interactions one try at a time; at each budget, execute what the method would do, and undo it.
+
+    Returns:
+        The tries.
+    """
     environment, history = recorder.environment, list[Interaction]()
     for budget in budgets:
         if context is not None:  # A proposer that has seen enough leaves the greater budgets with what there is.
             left_to_try = budget - len(history)
             history += recorder.interact(context, left_to_try, Role.CONTEXT, history=history, method=method)
         if not recorder.sound or not environment.observe().movable.any():
-            return
+            return history
         left = environment.state()
         # Without tries, the one is the other.
         for role, state in ((Role.EXPLOIT, left), (Role.EXPLOIT_AT_START, start))[: 1 if context is None else 2]:
             recorder.interact(exploiter, 1, role, history=history, start=state, method=method, budget=budget)
             if not recorder.sound:
-                return
+                return history
         environment.restore(left)
+    return history

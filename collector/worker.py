@@ -128,8 +128,10 @@ class Worker:
         with clock.stage("load"):
             return self._objects.load(object_of(plan, index), plan.setting.collection.collision)
 
-    def _proposer(self, plan: Plan, name: str, rng: np.random.Generator, version: int) -> Proposer:
-        """The proposer called `name`, of a policy version."""
+    def _proposer(
+        self, plan: Plan, name: str, rng: np.random.Generator, version: int, share: float | None = None
+    ) -> Proposer:
+        """The proposer called `name`, of a policy version; `share` as `proposer_named` takes it."""
         if name == RandomProposer.name:
             return RandomProposer(rng, plan.setting.terms.edge_share)
         from shared.policies.proposers import proposer_named
@@ -138,7 +140,7 @@ class Worker:
             return proposer_named(name, None, rng, plan.most_tries)
         if version not in self._adapters:
             self.load_policy(version, self._store.read_policy(version))
-        return proposer_named(name, self._adapters[version], rng, plan.most_tries)
+        return proposer_named(name, self._adapters[version], rng, plan.most_tries, share)
 
 
 def _empty(records: Sequence[RolloutRecord]) -> dict[str, dict[str, int]]:

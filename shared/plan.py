@@ -48,6 +48,9 @@ class EvaluationConfig(StrictModel):
     budgets: tuple[Budget, ...] = Field((1, 2, 4), min_length=1)
     queries: int = Field(24, ge=1)
     """Random test interactions a rollout, which critics are asked about (F-score)."""
+    exploit_share: float | None = Field(None, gt=0, le=1, exclude_if=lambda share: share is None)
+    """Also act at a point drawn from this share of the cloud's points, the best ones, where the tries began; AIP then
+    draws the points of its tries so, too. As published: 0.01. None: not done; documents leave it out."""
 
 
 class Setting(StrictModel):
@@ -89,6 +92,11 @@ class Setting(StrictModel):
     def dynamics(self) -> DynamicsRanges:
         """What hidden parameters are drawn from; the task is looked up only where the setting leaves it to it."""
         return self.collection.dynamics or self.terms.dynamics
+
+    @property
+    def primitive(self) -> str:
+        """What interactions execute; the task is looked up as for `dynamics`."""
+        return self.collection.primitive or self.terms.primitive
 
     @property
     def terms(self) -> Terms:

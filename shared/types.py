@@ -53,6 +53,11 @@ class OutcomeKind(StrEnum):
         """Whether a learner may use the row."""
         return self is not OutcomeKind.ABANDONED
 
+    @property
+    def is_valid(self) -> bool:
+        """Whether the primitive ran to its end: what it closed its fingers on was held, and no contact was refused."""
+        return self in (OutcomeKind.OK, OutcomeKind.NO_CONTACT)
+
 
 class Direction(StrEnum):
     """Which ways a joint turns from where it starts; hidden from view ("pushing faucet" in the paper)."""
@@ -86,6 +91,10 @@ class Role(StrEnum):
     """The action that the adapted affordance chooses at the end, where the tries left the object (sample-success)."""
     EXPLOIT_AT_START = "exploit-at-start"
     """What it chooses where the tries began, so that methods can be compared on one state (start-success)."""
+    CONTEXT_BY_SHARE = "context-by-share"
+    """A try whose point was drawn from the best share of the cloud instead of being the best of all."""
+    EXPLOIT_BY_SHARE = "exploit-by-share"
+    """What the adapted affordance chooses where the tries began, at a point drawn from the best share of the cloud."""
 
 
 @dataclass(frozen=True, slots=True, init=False)

@@ -185,13 +185,14 @@ class Campaign:
         run, rollouts, version = self._run, self._config.rollouts, self._config.alternations + 1
         evaluation = Evaluation(
             store=Store.open(run.evaluation),
-            policies=Store.open(run.store),
+            policies=Store.open(run.store).read_policy,
             version=version,
             rollouts=rollouts.total(rollouts.evaluation, len(run.objects_used().test)),
             per_shard=rollouts.per_shard,
             objects=run.objects_folder(),
             oracle=run.oracle,
             out=run.training("evaluate"),
+            root=run.path,
         )
         collected = evaluation.execute(self._crew, self._say)
         return {**figures_of(collected), "policy": version}

@@ -171,10 +171,15 @@ class _Costs:
         """Random queries, then every method's tries, each from a state of its own, and its actions."""
         told = self.config.evaluation
         methods = [METHODS.get(name) for name in told.methods]
-        tries = [max(method.budgets(told.budgets)) if method.tries else 0 for method in methods]
+        trying = list(methods)
         # Twice where there are tries: where these left the object, and where they began.
         chosen = sum(len(method.budgets(told.budgets)) * (2 if method.tries else 1) for method in methods)
-        by_policy = chosen + sum(n for n, m in zip(tries, methods, strict=True) if m.tries not in (None, RANDOM))
+        if told.exploit_share is not None:
+            # Once more where they began, after tries of their own where these are drawn.
+            chosen += sum(len(method.budgets(told.budgets)) for method in methods)
+            trying += [method for method in methods if method.draws_tries]
+        tries = [max(method.budgets(told.budgets)) if method.tries else 0 for method in trying]
+        by_policy = chosen + sum(n for n, m in zip(tries, trying, strict=True) if m.tries not in (None, RANDOM))
         interactions = rollouts * (told.queries + sum(tries) + chosen)
         clouds = rollouts * (1 + sum(tries))
         judging_s = clouds * FORWARD_SHARE * self.encode_s * 3

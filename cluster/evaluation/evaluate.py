@@ -30,23 +30,25 @@ class Evaluation:
 
     Attributes:
         store: of the evaluation's setting.
-        policies: a store that holds the policies, which are copied, so that the evaluation stands alone.
+        policies: reads a policy's files by version; they are copied, so that the evaluation stands alone.
         version: the policy that is evaluated.
         rollouts: how many trials there shall be in all, those of earlier attempts included.
         per_shard: trials a shard.
         objects: folder of the objects.
         oracle: folder of the training of AAP, which may have left an oracle.
         out: folder of the table.
+        root: folder of all this, which may be published; what is printed names paths relative to it.
     """
 
     store: Store
-    policies: Store
+    policies: Callable[[int], Mapping[str, bytes]]
     version: int
     rollouts: int
     per_shard: int
     objects: Path
     oracle: Path
     out: Path
+    root: Path
 
     @property
     def config(self) -> EvaluationConfig:
@@ -75,18 +77,20 @@ class Evaluation:
             collected = collect(self.store, plan, self.rollouts, self.per_shard, open_worker_group, self.objects)
             crew.dismiss()
             told = {"store": self.store.where, "version": self.version, "out": str(self.out), "aap": str(self.oracle)}
-            with closing(Child(say, Path(self.policies.where).parent)) as child:
+            with closing(Child(say, self.root)) as child:
                 child.run("cluster.evaluation.policy_evaluation:write_judgement", told, self.out)
         return collected
 
     def _publish(self) -> None:
         """Copy the policies that the methods use, after a look at whether they hold all networks that are needed."""
         for version in versions_of(self.config.methods, self.version):
-            files = self.policies.read_policy(version)
+            files = self.policies(version)
             policy = Policy.from_files(files)
             for name in self.config.methods:
                 if METHODS.get(name).policy_version(self.version) == version:
                     policy.require(*METHODS.get(name).modules)
+            if version in self.store.policy_versions() and self.store.read_policy(version) != files:
+                raise UsageError(f"{self.store.where}: holds trials of another policy; name another folder")
             self.store.publish_policy(version, files)
 
 

@@ -50,6 +50,7 @@ def evaluate_policy(store: Store, version: int, oracle: Path) -> EvaluationTable
         objects=len(tried),
         rollouts=sum(part.stop - part.start for part in store.parts()),
         policy_version=version,
+        exploit_share=config.exploit_share,
         store_digest=store.digest(),
         contents={ref.id: ref.content_hash for ref in store.setting.objects if ref.id in tried},
         rows=tuple(finite(_values(row) | {"gap_closed": _gap_closed(row, rows)}) for row in rows),

@@ -1,28 +1,68 @@
-"""An evaluation of a run by itself: which of its policies, on which objects, and where the table goes."""
+"""An evaluation by itself: of which policy, on which objects, and where the table goes."""
 
+import glob
 import hashlib
+import re
 import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
+from adaafford.pretrained import load_policy, pretrained_names
 from cluster.config.campaign_config import CampaignConfig
 from cluster.config.evaluation_settings import EvaluateSettings
 from cluster.config.objects import objects_for
 from cluster.evaluation.evaluate import Evaluation
 from cluster.evaluation.tables import MARKDOWN_FILE, RESULTS_FILE
-from cluster.runs.run_folder import ObjectsUsed, RunFolder, find
-from cluster.runs.warm_start import seen_by
+from cluster.runs.run_folder import RunFolder, find
+from cluster.runs.warm_start import folder_of, seen_by, unknown
 from cluster.workers.session import Crew, worker_groups
 from collector.setting import make_setting
 from collector.watchdog import Limits
+from shared.config import CollectionConfig
 from shared.errors import UsageError
 from shared.io.text import plain
 from shared.plan import EvaluationConfig, ObjectRef, Setting
 from shared.policies.methods import METHODS, MethodName
-from shared.policies.policy import Policy
+from shared.policies.policy import WEIGHTS_FILE, Policy
 from shared.store import Store
-from shared.tasks import Task
+from shared.tasks import TASKS, Task, task_named
+
+EVALUATIONS = Path("evaluations")
+"""Where tables of policies without a run go, unless a folder is named."""
+ONLY_VERSION = 1
+"""What trials of a policy without a run call it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Subject:
+    """A policy that is evaluated.
+
+    Attributes:
+        policy: it.
+        files: reads the files of a version.
+        version: its own.
+        methods: those that can be compared.
+        collection: how its trials are seen and simulated.
+        oracle: folder that may hold the oracle which taught it.
+        root: the run's folder; None: it is without one.
+        evaluations: folder of tables, unless one is named.
+        label: what a folder there calls the policy.
+        identity: what tells it from other policies that have the label.
+    """
+
+    policy: Policy
+    files: Callable[[int], Mapping[str, bytes]]
+    version: int
+    methods: tuple[MethodName, ...]
+    collection: CollectionConfig
+    oracle: Path
+    root: Path | None
+    evaluations: Path
+    label: str
+    identity: str
 
 
 def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> None:
@@ -32,33 +72,119 @@ def evaluate_run(path: Path, settings: EvaluateSettings, out: Path | None) -> No
         AdaAffordError: the run has no such policy, the objects or methods do not suit, or a worker failed.
     """
     run, config = find(path)
+    if settings.collection != CollectionConfig():
+        raise UsageError("a run is evaluated on what it was trained on; --collection settings are for --policy")
     policies, used = Store.open(run.store), run.objects_used()
-    version = _version(run, policies, settings.policy)
+    version = _version(run, policies, settings.policy_version)
     policy = Policy.from_files(policies.read_policy(version))
-    task = _task(config, settings)
-    refs, folder = _objects(task, settings, run, used)
+    trained = config.task_record
+    task = _task(trained, trained.terms(config.collection).primitive, settings, config.collection)
+    if settings.objects is None:
+        tested = frozenset(used.test)
+        refs, folder = _objects(task, settings, run.objects_folder(), tested.__contains__)
+    else:
+        # By content: the same object may lie in two folders, under two names.
+        seen = seen_by(str(run.path))
+        refs, folder = _objects(task, settings, settings.objects, lambda ref: ref.content_hash not in seen)
+    subject = _Subject(
+        policy=policy,
+        files=policies.read_policy,
+        version=version,
+        methods=_possible_methods(policy),
+        collection=config.collection,
+        oracle=run.oracle,
+        root=Path(policies.where).parent,
+        evaluations=run.evaluations,
+        label=f"v{version}",
+        identity=str(version),
+    )
+    _evaluate(subject, task, refs, folder, settings, config.seed, out)
+
+
+def evaluate_without_run(source: str, settings: EvaluateSettings, out: Path | None) -> None:
+    """Evaluate the policy of a name or place, and print the table.
+
+    Args:
+        source: as `load_policy` takes it; of a run, this is `evaluate_run`.
+        settings: must name a folder of objects.
+        out: folder of the table; None: one below `EVALUATIONS`.
+
+    Raises:
+        AdaAffordError: there is none, the objects or methods do not suit, or a worker failed.
+    """
+    if source not in pretrained_names() and RunFolder(Path(source)).config.is_file():
+        evaluate_run(Path(source), settings, out)
+        return
+    policy = load_policy(source)
+    if settings.policy_version is not None:
+        raise UsageError(f"--policy {source} is one policy; --policy-version is for --run")
+    if settings.objects is None:
+        raise UsageError(f"--policy {source} brings no test objects; name a folder with --objects")
+    methods = tuple(name for name in _possible_methods(policy) if METHODS.get(name).version is None)
+    for name in settings.methods:
+        if METHODS.get(name).version is not None:
+            raise UsageError(f"method '{name}' uses an earlier policy of a run; name the run with --run")
+    if not methods:
+        raise UsageError(f"--policy {source}: none of its networks is trained; name a trained policy")
+    if settings.task is not None and policy.task not in TASKS.names():
+        task = settings.task_record  # A file defined the policy's task; only its user can tell whether the two agree.
+    else:
+        trained = task_named(policy.task)
+        task = _task(trained, trained.primitive, settings, settings.collection)
+    if not (seen := seen_by(source)):
+        Console(file=sys.stderr, highlight=False).print(f"policy {unknown(source)}", markup=False, soft_wrap=True)
+    refs, folder = _objects(task, settings, settings.objects, lambda ref: ref.content_hash not in seen)
+    files = policy.to_files()
+    place = folder_of(source)
+    subject = _Subject(
+        policy=policy,
+        files=lambda version: files,
+        version=ONLY_VERSION,
+        methods=methods,
+        collection=settings.collection,
+        oracle=place,
+        root=None,
+        evaluations=EVALUATIONS,
+        label=re.sub(r"[^A-Za-z0-9._-]", "_", place.name)[:100] or "policy",
+        identity=hashlib.sha256(files[WEIGHTS_FILE]).hexdigest(),
+    )
+    _evaluate(subject, task, refs, folder, settings, CampaignConfig().seed, out)
+
+
+def _evaluate(
+    subject: _Subject,
+    task: Task,
+    refs: tuple[ObjectRef, ...],
+    folder: Path,
+    settings: EvaluateSettings,
+    seed: int,
+    out: Path | None,
+) -> None:
+    """Do what is left of the trials on objects of a folder, and print the table."""
     setting = make_setting(
         task,
-        config.collection,
+        subject.collection,
         kind="evaluation",
-        seed=config.seed if settings.seed is None else settings.seed,
+        seed=seed if settings.seed is None else settings.seed,
         objects=refs,
         evaluation=EvaluationConfig(
-            methods=tuple(dict.fromkeys(settings.methods)) or _possible_methods(policy),
+            methods=tuple(dict.fromkeys(settings.methods)) or subject.methods,
             budgets=tuple(sorted(set(settings.budgets))),
             queries=settings.queries,
+            exploit_share=settings.exploit_share,
         ),
     )
-    out = out if out is not None else _default_out(run, setting, folder, version)
+    out = out if out is not None else _default_out(subject, setting, folder)
     evaluation = Evaluation(
         store=Store.create(out / "store", setting),
-        policies=policies,
-        version=version,
+        policies=subject.files,
+        version=subject.version,
         rollouts=settings.trials * len(refs),
         per_shard=settings.per_shard,
         objects=folder,
-        oracle=run.oracle,
+        oracle=subject.oracle,
         out=out,
+        root=out if subject.root is None else subject.root,
     )
     _execute(evaluation, settings)
     for line in (out / MARKDOWN_FILE).read_text(encoding="utf-8").splitlines():
@@ -80,42 +206,32 @@ def _version(run: RunFolder, policies: Store, wanted: int | None) -> int:
     return known[-1] if wanted is None else wanted
 
 
-def _task(config: CampaignConfig, settings: EvaluateSettings) -> Task:
-    """The task to evaluate on; the networks were trained for one primitive and know no other."""
-    trained = config.task_record
+def _task(trained: Task, primitive: str, settings: EvaluateSettings, collection: CollectionConfig) -> Task:
+    """The task to evaluate on.
+
+    Raises:
+        UsageError: it needs another primitive than `primitive`, which is all that the networks know.
+    """
     task = trained if settings.task is None else settings.task_record
-    if task.primitive != trained.primitive:
+    if (needed := task.terms(collection).primitive) != primitive:
         raise UsageError(
-            f"the run is trained to {trained.primitive} (task '{trained.name}'), and task '{task.name}' needs "
-            f"{task.primitive}; name a task of the same primitive"
+            f"the policy is trained to {primitive} (task '{trained.name}'), and task '{task.name}' needs {needed}; "
+            "name a task of the same primitive"
         )
     return task
 
 
 def _objects(
-    task: Task, settings: EvaluateSettings, run: RunFolder, used: ObjectsUsed
+    task: Task, settings: EvaluateSettings, folder: Path, allowed: Callable[[ObjectRef], bool]
 ) -> tuple[tuple[ObjectRef, ...], Path]:
-    """The run's test objects, or all of another folder that suit the task and were not trained on; and their folder.
-
-    Args:
-        task: what is evaluated.
-        settings: may name another folder.
-        run: whose policy it is.
-        used: by the run.
+    """The objects of a folder that suit the task, are selected and may be tested on; and their folder.
 
     Raises:
         UsageError: none is left.
     """
-    own = run.objects_folder() if settings.objects is None else settings.objects
-    selection = settings.model_copy(update={"objects": own})
-    catalogue, folder = objects_for(task, selection, own, per_category=0, seed=0)
-    refs = {entry.ref for entry in catalogue.usable}
-    if settings.objects is None:
-        refs &= set(used.test)
-    else:
-        # By content: the same object may lie in two folders, under two names.
-        seen = seen_by(str(run.path))
-        refs = {ref for ref in refs if ref.content_hash not in seen}
+    selection = settings.model_copy(update={"objects": folder})
+    catalogue, folder = objects_for(task, selection, folder, per_category=0, seed=0)
+    refs = {entry.ref for entry in catalogue.usable if allowed(entry.ref)}
     if not refs:
         raise UsageError(f"{folder}: no object suits task '{task.name}' and was not trained on; name other objects")
     return tuple(sorted(refs, key=lambda ref: ref.id)), folder
@@ -126,8 +242,9 @@ def _possible_methods(policy: Policy) -> tuple[MethodName, ...]:
     return tuple(name for name in METHODS.names() if policy.trained.issuperset(METHODS.get(name).modules))
 
 
-def _default_out(run: RunFolder, setting: Setting, folder: Path, version: int) -> Path:
+def _default_out(subject: _Subject, setting: Setting, folder: Path) -> Path:
     """A folder that other settings do not share, and people can tell apart; the same after the objects have moved."""
-    digest = hashlib.sha256(f"{version} {setting.model_dump_json()}".encode()).hexdigest()
-    begun = sorted(run.evaluations.glob(f"{setting.task}-*-v{version}-{digest[:8]}"))
-    return begun[0] if begun else run.evaluations / f"{setting.task}-{folder.name or 'objects'}-v{version}-{digest[:8]}"
+    digest = hashlib.sha256(f"{subject.identity} {setting.model_dump_json()}".encode()).hexdigest()
+    begins, ends = f"{setting.task}-", f"-{subject.label}-{digest[:8]}"
+    begun = sorted(subject.evaluations.glob(f"{begins}*{glob.escape(ends)}"))
+    return begun[0] if begun else subject.evaluations / f"{begins}{folder.name or 'objects'}{ends}"

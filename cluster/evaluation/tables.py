@@ -21,13 +21,19 @@ from shared.policies.methods import METHODS, MethodName
 
 RESULTS_FILE, CSV_FILE, MARKDOWN_FILE = "results.json", "table.csv", "table.md"
 
-Measure = Literal["f_score", "sample_success", "start_success"]
+Measure = Literal["f_score", "sample_success", "start_success", "mix_f_score", "shifted_f_score", "share_success"]
 MEASURES: Mapping[Measure, str] = {
     "f_score": "F-score",
     "sample_success": "sample-success",
     "start_success": "from the start",
 }
 """What methods are compared by, and what people call it; the paper has no figures of the last."""
+LIKE_FOR_LIKE: Mapping[Measure, str] = {
+    "mix_f_score": "F, published mix",
+    "shifted_f_score": "F, published mix, shifted",
+    "share_success": "sample-success, best share",
+}
+"""The same measured as the paper did, so that absolute figures can be compared with its (docs/evaluation.md)."""
 _SHOWN: Mapping[str, str] = {
     "method": "method",
     "budget": "tries",
@@ -38,9 +44,10 @@ _SHOWN: Mapping[str, str] = {
     "bce": "BCE",
     "auc": "AUC",
     "mean_tries": "tries made",
+    **{str(name): shown for name, shown in LIKE_FOR_LIKE.items()},
 }
 """Columns that people see, and what they call them."""
-_PERCENT = frozenset({*MEASURES, "gap_closed", "best_f"})
+_PERCENT = frozenset({*MEASURES, *LIKE_FOR_LIKE, "gap_closed", "best_f"})
 _ONLY_FOR_PROGRAMS = frozenset({"counts"})
 BEST_METHOD: MethodName = "ours-final"
 WITHOUT_TRIES = (PRIOR_METHOD, NO_TRIES_METHOD, ORACLE_METHOD)
@@ -49,7 +56,10 @@ ORDER = (*METHODS.names(), NO_TRIES_METHOD, ORACLE_METHOD)
 
 
 class ResultRow(BaseModel):
-    """A row of results.json: a method after a budget. See `learner.evaluation.table.EvaluationRow`."""
+    """A row of results.json: a method after a budget. See `learner.evaluation.table.EvaluationRow`.
+
+    What older versions did not measure is None in their files.
+    """
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
@@ -64,6 +74,16 @@ class ResultRow(BaseModel):
     start_success: float | None = None
     start_success_low: float | None = None
     start_success_high: float | None = None
+    mix_f_score: float | None = None
+    mix_f_score_low: float | None = None
+    mix_f_score_high: float | None = None
+    shifted_f_score: float | None = None
+    shifted_f_score_low: float | None = None
+    shifted_f_score_high: float | None = None
+    share_success: float | None = None
+    share_success_low: float | None = None
+    share_success_high: float | None = None
+    mix_base_rate: float | None = None
     trials: int
     gap_closed: float | None = None
     best_f: float | None
@@ -91,6 +111,7 @@ class ResultRows(BaseModel):
 
     task: str = Field("", max_length=100)
     objects: int = Field(ge=0)
+    exploit_share: float | None = None
     rows: tuple[ResultRow, ...]
 
 
@@ -104,6 +125,7 @@ class EvaluationTable:
         objects: how many there were trials of.
         rollouts: how many trials in all; each fills the interactions anew for every method.
         policy_version: of the policy that was evaluated.
+        exploit_share: of a cloud's points, see `shared.plan.EvaluationConfig`.
         store_digest: of the interactions that the figures are of.
         contents: of these objects, SHA-256 by id, since runs call other objects the same.
         rows: a row for each method and budget: the fields of `learner.evaluation.table.EvaluationRow` ("best_f" for
@@ -115,6 +137,7 @@ class EvaluationTable:
     objects: int
     rollouts: int
     policy_version: int
+    exploit_share: float | None
     store_digest: str
     contents: Mapping[str, str]
     rows: tuple[Mapping[str, Any], ...]
@@ -135,20 +158,41 @@ def write_tables(out: Path, table: EvaluationTable) -> None:
 
 def as_markdown(table: EvaluationTable) -> str:
     """The table as the paper has it, with 95% intervals; percent where the paper has percent."""
-    base_rate = next((row["base_rate"] for row in table.rows), None)
-    shown = "none" if base_rate is None else f"{100 * base_rate:.1f}%"
+    measured = [name for name in LIKE_FOR_LIKE if any(row[name] is not None for row in table.rows)]
+    shown = {name: title for name, title in _SHOWN.items() if name in measured or name not in LIKE_FOR_LIKE}
+    natural, published = (next((row[name] for row in table.rows), None) for name in ("base_rate", "mix_base_rate"))
     lines = [
         f"# {markdown(table.task)}",
         "",
         f"{table.rollouts} trials on {table.objects} test objects, seed {table.seed}, policy {table.policy_version}. "
-        f"F-score at threshold 0.5 on random interactions, of which {shown} succeed. In brackets: 95% bootstrap "
-        "intervals over objects. Sample-success: where the tries left the object, as in the paper; from the start: "
-        "where they began. Gap closed: of that in F-score between Where2Act and the oracle, which is told the hidden "
-        f"facts. Digest of the interactions: `{table.store_digest[:16]}`.",
+        f"F-score at threshold 0.5 on random interactions, of which {percent(natural)}% succeed. In brackets: 95% "
+        "bootstrap intervals over objects. Sample-success: where the tries left the object, as in the paper; from the "
+        "start: where they began. Gap closed: of that in F-score between Where2Act and the oracle, which is told the "
+        f"hidden facts. {like_for_like_note(published, table.exploit_share)} Digest of the interactions: "
+        f"`{table.store_digest[:16]}`.",
         "",
-        *markdown_table(list(_SHOWN.values()), ([_cell(row, name) for name in _SHOWN] for row in table.rows)),
+        *markdown_table(list(shown.values()), ([_cell(row, name) for name in shown] for row in table.rows)),
     ]
     return "\n".join(lines) + "\n"
+
+
+def like_for_like_note(base_rate: float | None, share: float | None) -> str:
+    """What the like-for-like columns are, in a few sentences.
+
+    Args:
+        base_rate: of success in the published mix.
+        share: of a cloud's points, from which actions by share were drawn; None: there were none.
+    """
+    note = (
+        "Published mix: the same questions, weighted as the paper's test rollouts were topped up by label, of which "
+        f"{percent(base_rate)}% succeed; shifted: with logits moved by the change of the base rate."
+    )
+    if share is not None:
+        note += (
+            f" Best share: the points of actions and of AIP's tries are drawn from the best {100 * share:g}% of the "
+            "cloud (published: 1%), and the action is executed where the tries began."
+        )
+    return note
 
 
 def _cell(row: Mapping[str, Any], name: str) -> str:

@@ -8,7 +8,7 @@ Files: comparison.md and comparison.png for people, comparison.csv and compariso
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +17,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from pydantic import model_validator
 
-from cluster.evaluation.published import PUBLISHED_MEASURES, published_figure
+from cluster.evaluation.published import PUBLISHED_MEASURES, STANDS_BESIDE, published_figure
 from cluster.evaluation.tables import (
     BEST_METHOD,
+    LIKE_FOR_LIKE,
     MEASURES,
     ORDER,
     RESULTS_FILE,
     WITHOUT_TRIES,
     ResultRow,
     ResultRows,
+    like_for_like_note,
     share_of_gap,
 )
 from cluster.reporting.style import COLOURS, SOFT
@@ -41,7 +43,7 @@ from shared.store import Store
 MARKDOWN_FILE, CSV_FILE, JSON_FILE, FIGURE_FILE = (f"comparison.{kind}" for kind in ("md", "csv", "json", "png"))
 MOST = 1 << 40
 """Of anything that is counted."""
-AVERAGED = ("best_f", "bce", "auc", "base_rate", "mean_tries")
+AVERAGED = ("best_f", "bce", "auc", "base_rate", "mix_base_rate", "mean_tries")
 """Figures that do not follow from counts: their means over runs."""
 
 COLUMNS = (
@@ -49,8 +51,9 @@ COLUMNS = (
     *("gap closed", "best F", "BCE", "AUC"),
 )
 """Of the table that people see."""
-
+_ALL_MEASURES = (*MEASURES, *LIKE_FOR_LIKE)
 _COUNTED = tuple(field.name for field in fields(ObjectCounts) if field.name != "object")
+_ALWAYS_COUNTED = frozenset(field.name for field in fields(ObjectCounts) if field.default is MISSING)
 
 
 class _Row(ResultRow):
@@ -58,7 +61,7 @@ class _Row(ResultRow):
 
     @model_validator(mode="after")
     def _whole(self) -> "_Row":
-        columns = [getattr(self.counts, name) for name in _COUNTED]
+        columns = [column for name in _COUNTED if (column := getattr(self.counts, name)) or name in _ALWAYS_COUNTED]
         if any(len(column) != len(self.counts.object) for column in columns):
             raise ValueError("counts of different lengths; evaluate again")
         if any(not 0 <= number <= MOST for column in columns for number in column):
@@ -88,8 +91,8 @@ class PooledRow:
     Attributes:
         method: which method.
         budget: how many tries.
-        shares: of each of `MEASURES`: the figure, and where its interval begins and ends.
-        by_run: of each of `MEASURES`: the figure in each run.
+        shares: of each of `MEASURES` and `LIKE_FOR_LIKE`: the figure, and where its interval begins and ends.
+        by_run: of each of these: the figure in each run.
         paper: of each of `PUBLISHED_MEASURES`: the paper's own figure, percent; None where it has none.
         gap_closed: the share of the gap in F-score between Where2Act and the oracle.
         trials: how many actions were executed where tries had left an object.
@@ -127,6 +130,7 @@ class Comparison:
         objects: different objects that were tested on.
         novel_categories: whether nothing was trained on any of their categories.
         base_rate: of success among random interactions, mean over runs.
+        exploit_share: of a cloud's points, from which actions by share were drawn; None: not in all runs.
         rows: in the order of the paper's tables.
     """
 
@@ -136,6 +140,7 @@ class Comparison:
     objects: int
     novel_categories: bool
     base_rate: float
+    exploit_share: float | None
     rows: tuple[PooledRow, ...]
 
 
@@ -165,6 +170,10 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         raise UsageError("only some of the runs were tested on novel categories; compare them apart")
     if len(tasks := sorted({each.task for each in results})) > 1:
         raise UsageError(f"the runs are of different tasks ({', '.join(tasks)}); give runs of one task")
+    shares = {each.exploit_share for each in results}
+    if len(shares - {None}) > 1:
+        given = ", ".join(f"{share:g}" for share in sorted(share for share in shares if share is not None))
+        raise UsageError(f"the runs were evaluated with different exploit_share ({given}); compare them apart")
     common = set.intersection(*({(row.method, row.budget) for row in each.rows} for each in results))
     if not common:
         raise UsageError("the runs share no method and budget; evaluate them alike")
@@ -178,6 +187,7 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         objects=len({each.contents.get(name, name) for each in results for name in each.rows[0].counts.object}),
         novel_categories=novel,
         base_rate=rows[0].averages["base_rate"],
+        exploit_share=None if None in shares else next(iter(shares)),
         rows=tuple(replace(row, gap_closed=share_of_gap(prior, row.shares["f_score"][0], oracle)) for row in rows),
     )
 
@@ -222,8 +232,8 @@ def _pooled(method: str, budget: int, results: Sequence[_Results], novel_categor
     return PooledRow(
         method=method,
         budget=budget,
-        shares={name: getattr(together, name)() for name in MEASURES},
-        by_run={name: tuple(getattr(each, name)()[0] for each in counts) for name in MEASURES},
+        shares={name: getattr(together, name)() for name in _ALL_MEASURES},
+        by_run={name: tuple(getattr(each, name)()[0] for each in counts) for name in _ALL_MEASURES},
         paper={
             measure: published_figure(task, method, budget, measure, novel_categories=novel_categories)
             for measure in PUBLISHED_MEASURES
@@ -240,14 +250,18 @@ def _by_content(counts: ObjectCounts, contents: Mapping[str, str]) -> ObjectCoun
 
 
 def _together(counts: Sequence[ObjectCounts]) -> ObjectCounts:
-    """The sums over runs, by object."""
+    """The sums over runs, by object; what one of them did not count is not counted."""
     names = sorted({name for each in counts for name in each.object})
     numbers = {name: number for number, name in enumerate(names)}
-    sums = {name: np.zeros(len(names), dtype=np.int64) for name in _COUNTED}
-    for each in counts:
-        for name in _COUNTED:
-            np.add.at(sums[name], [numbers[own] for own in each.object], getattr(each, name))
-    return ObjectCounts(object=tuple(names), **{name: tuple(column.tolist()) for name, column in sums.items()})
+    sums: dict[str, tuple[Any, ...]] = {}
+    for name in _COUNTED:
+        columns = [getattr(each, name) for each in counts]
+        if name in _ALWAYS_COUNTED or all(columns):
+            total = np.zeros(len(names), dtype=np.result_type(*map(np.asarray, columns)))
+            for each, column in zip(counts, columns, strict=True):
+                np.add.at(total, [numbers[own] for own in each.object], column)
+            sums[name] = tuple(total.tolist())
+    return ObjectCounts(object=tuple(names), **sums)
 
 
 def _share_of(rows: Sequence[PooledRow], method: str) -> float:
@@ -284,6 +298,7 @@ def as_markdown(comparison: Comparison) -> str:
         "",
         *markdown_table(COLUMNS, map(_cells, comparison.rows)),
         "",
+        *_like_for_like(comparison),
         "Run by run (F-score / sample-success / from the start):",
         "",
         *markdown_table(
@@ -308,6 +323,21 @@ def _cells(row: PooledRow) -> list[str]:
         number(row.averages["bce"]),
         number(row.averages["auc"]),
     ]
+
+
+def _like_for_like(comparison: Comparison) -> list[str]:
+    """A table of what was measured as in the paper, and an empty line; none where a run is of an older version."""
+    rows = comparison.rows
+    measured = [name for name in LIKE_FOR_LIKE if not all(math.isnan(row.shares[name][0]) for row in rows)]
+    if not measured:
+        return []
+    head, cells = ["method", "tries"], [[markdown(row.method), str(row.budget)] for row in rows]
+    for name in measured:
+        head += [LIKE_FOR_LIKE[name], "paper"]
+        for row, of_row in zip(rows, cells, strict=True):
+            of_row += [_with_limits(row.shares[name]), _of_paper(row.paper[STANDS_BESIDE[name]])]
+    note = like_for_like_note(rows[0].averages["mix_base_rate"], comparison.exploit_share)
+    return [f"Like for like with the paper. {note}", "", *markdown_table(head, cells), ""]
 
 
 def _by_run(row: PooledRow) -> list[str]:

@@ -7,8 +7,18 @@ from pathlib import Path
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from cluster.evaluation.published import published, published_figure
-from cluster.evaluation.tables import BEST_METHOD, MEASURES, ORDER, WITHOUT_TRIES, Measure, ResultRow, ResultRows
+from cluster.evaluation.published import STANDS_BESIDE, published, published_figure
+from cluster.evaluation.tables import (
+    BEST_METHOD,
+    LIKE_FOR_LIKE,
+    MEASURES,
+    ORDER,
+    WITHOUT_TRIES,
+    Measure,
+    ResultRow,
+    ResultRows,
+    like_for_like_note,
+)
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
 from cluster.reporting.style import COLOURS, SOFT, laid_out
 from cluster.runs.run_folder import read_json
@@ -26,12 +36,14 @@ class Results:
         rows: a method and a budget each.
         novel_categories: whether the test objects are of categories that nothing was trained on.
         objects: how many there were trials of.
+        exploit_share: of a cloud's points, see `shared.plan.EvaluationConfig`.
     """
 
     task: str
     rows: tuple[ResultRow, ...]
     novel_categories: bool = False
     objects: int = 0
+    exploit_share: float | None = None
 
     @property
     def budgets(self) -> list[int]:
@@ -80,7 +92,7 @@ def read_results(path: Path, task: str = "", *, novel_categories: bool = False) 
         UsageError: it does not hold results.
     """
     read = parse(ResultRows, read_json(path), str(path))
-    return Results(read.task or task, read.rows, novel_categories, read.objects)
+    return Results(read.task or task, read.rows, novel_categories, read.objects, read.exploit_share)
 
 
 def results_section(results: Results) -> Section:
@@ -97,13 +109,15 @@ def results_section(results: Results) -> Section:
             "In italics: the paper's own figures. Its objects, physics and random draws were others, so that orders "
             "and trends can be compared, but not single figures.",
         )
-    tables = (table_of(results), details_of(results))
+    tables = (table_of(results), *like_for_like(results), details_of(results))
     return Section("results", "Methods and budgets", lead, tables=tables, drawings=(_curves(results),))
 
 
 def further_section(evaluations: Sequence[tuple[str, Results]]) -> Section:
     """Tables of evaluations on other objects, by their names."""
-    tables = [table_of(results, f"{shortened(name)}: {shortened(results.task)}") for name, results in evaluations]
+    tables: list[Table] = []
+    for name, results in evaluations:
+        tables += [table_of(results, f"{shortened(name)}: {shortened(results.task)}"), *like_for_like(results)]
     return Section(
         "further", "Further evaluations", ("Of the same policy, by `adaafford evaluate`.",), tables=tuple(tables)
     )
@@ -129,10 +143,21 @@ def tiles(results: Results) -> tuple[Tile, ...]:
     return tuple(shown)
 
 
-def table_of(results: Results, caption: str = "") -> Table:
+def like_for_like(results: Results) -> tuple[Table, ...]:
+    """The table of what was measured as in the paper; none for files that older versions wrote."""
+    found = {name for name in LIKE_FOR_LIKE for row in results.rows if row.value(name) is not None}
+    measured = {name: shown for name, shown in LIKE_FOR_LIKE.items() if name in found}
+    if not measured:
+        return ()
+    base_rate = next((row.mix_base_rate for row in results.rows), None)
+    note = like_for_like_note(base_rate, results.exploit_share)
+    return (table_of(results, f"Like for like with the paper. {note}", measured),)
+
+
+def table_of(results: Results, caption: str = "", measures: Mapping[Measure, str] = MEASURES) -> Table:
     """Methods by budgets, beside the paper's."""
-    columns = [(measure, budget) for measure in MEASURES for budget in results.budgets]
-    beside = {measure for measure in MEASURES if results.has_paper and measure != "start_success"}
+    columns = [(measure, budget) for measure in measures for budget in results.budgets]
+    beside = {measure for measure in measures if results.has_paper and measure in STANDS_BESIDE}
     second: Row = (Cell("tries", kind="name"),)
     for measure, budget in columns:
         second += (Cell(str(budget)), *([Cell("paper", kind="paper")] if measure in beside else []))
@@ -146,7 +171,7 @@ def table_of(results: Results, caption: str = "") -> Table:
                 paper = results.of_paper(method, budget, measure)
                 cells += (Cell("" if paper is None else f"{paper:.1f}", kind="paper"),)
         body.append(cells)
-    spans = [(name, (2 if measure in beside else 1) * len(results.budgets)) for measure, name in MEASURES.items()]
+    spans = [(name, (2 if measure in beside else 1) * len(results.budgets)) for measure, name in measures.items()]
     first: Row = (Cell("method", kind="name"), *(Cell(name, span=span) for name, span in spans))
     return Table((first, second), tuple(body), caption)
 

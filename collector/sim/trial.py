@@ -86,11 +86,10 @@ class Trial:
         scene.park()
         if not np.isfinite(scene.joint_positions()).all() or np.abs(scene.joint_positions()).max() > SANE_POSITION:
             return Outcome(OutcomeKind.UNSTABLE, 0.0, False, float(start), steps=self.steps)
-        valid = kind in (OutcomeKind.OK, OutcomeKind.NO_CONTACT)
         return Outcome(
             kind=kind,
-            motion=float(abs(end - start)) if valid else 0.0,
-            success=valid and self._succeeded(start, end, displacement),
+            motion=float(abs(end - start)) if kind.is_valid else 0.0,
+            success=kind.is_valid and self._succeeded(start, end, displacement),
             start_joint_position=float(start),
             end_joint_position=float(end),
             displacement=displacement,

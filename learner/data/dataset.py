@@ -56,6 +56,7 @@ class Rows:
         step: [I], number within the rollout.
         continued: [I], whether the row began where the one before it left the object.
         facts: [I, facts], for the oracle only (see `learner.data.privileged`).
+        valid: [I], whether the primitive ran to its end (see `shared.types.OutcomeKind.is_valid`).
         role, method: [I], names (see `shared.records.InteractionRecord`).
         budget: [I].
     """
@@ -69,6 +70,7 @@ class Rows:
     step: Tensor
     continued: Tensor
     facts: Tensor
+    valid: NDArray[np.bool_]
     role: NDArray[np.str_]
     method: NDArray[np.str_]
     budget: NDArray[np.int64]
@@ -83,6 +85,7 @@ class Dataset:
 
     Attributes:
         task: of the store.
+        primitive: what its interactions execute.
         clouds: every cloud once, with its neighbour indices, view frame.
         movable: [O, N].
         middles: of the movable points, [O, 3].
@@ -93,6 +96,7 @@ class Dataset:
     """
 
     task: str
+    primitive: str
     clouds: CloudBatch
     movable: Tensor
     middles: Tensor
@@ -147,6 +151,7 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
     objects, of_object = _coded(table, "object_id")
     return Dataset(
         task=store.setting.task,
+        primitive=store.setting.primitive,
         clouds=batch,
         movable=masks,
         middles=middles,
@@ -301,6 +306,7 @@ def _rows(
         step=torch.from_numpy(cells["step"].astype(np.int64)),
         continued=torch.from_numpy(cells["order"] == Order.CONTINUE.value),
         facts=torch.from_numpy(facts),
+        valid=np.isin(cells["outcome"], [kind.value for kind in OutcomeKind if kind.is_valid]),
         role=cells["role"],
         method=cells["method"],
         budget=cells["budget"].astype(np.int64),

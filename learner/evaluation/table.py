@@ -17,6 +17,7 @@ from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import FrozenFeatures
 from learner.evaluation.bootstrap import ratio_interval
 from learner.evaluation.critics import OracleScores, row_critic
+from learner.evaluation.published_mix import mix_for, shifted_threshold
 from learner.metrics import THRESHOLD, discrimination
 from learner.stages.oracle import OracleCritic
 from learner.stages.trainers import RowCritic
@@ -33,6 +34,9 @@ NO_TRIES_METHOD = "aap-no-tries"
 ORACLE_METHOD = "oracle"
 """A critic that is told the hidden facts: the bound of what tries can teach. It acts on nothing, so has no exploits."""
 
+SHARES = ("f_score", "sample_success", "start_success", "mix_f_score", "shifted_f_score", "share_success")
+"""Figures that follow from counts by object, so that they have intervals over objects and can be pooled."""
+
 
 @dataclass(frozen=True, slots=True)
 class ObjectCounts:
@@ -48,6 +52,14 @@ class ObjectCounts:
         successes: those that succeeded.
         start_trials: EXPLOIT_AT_START rows; where a method tries nothing, these are the EXPLOIT rows.
         start_successes: those that succeeded.
+        mix_true: published rows that successful QUERY rows stand for (see `learner.evaluation.published_mix`). This and
+            what follows is empty where it was not counted, as in results of older versions.
+        mix_claimed: those that rows stand for which the critic called successes.
+        mix_hits: those that both hold of.
+        shifted_claimed: as `mix_claimed`, after the shift of the base rate.
+        shifted_hits: those that both hold of.
+        share_trials: EXPLOIT_BY_SHARE rows; empty where the evaluation executes none.
+        share_successes: those that succeeded.
     """
 
     object: tuple[str, ...]
@@ -59,6 +71,13 @@ class ObjectCounts:
     successes: tuple[int, ...]
     start_trials: tuple[int, ...]
     start_successes: tuple[int, ...]
+    mix_true: tuple[float, ...] = ()
+    mix_claimed: tuple[float, ...] = ()
+    mix_hits: tuple[float, ...] = ()
+    shifted_claimed: tuple[float, ...] = ()
+    shifted_hits: tuple[float, ...] = ()
+    share_trials: tuple[int, ...] = ()
+    share_successes: tuple[int, ...] = ()
 
     def f_score(self) -> tuple[float, float, float]:
         """F1 = 2 hits / (claimed + true), and its 95% interval over objects; NaN where nothing is claimed or true."""
@@ -71,6 +90,26 @@ class ObjectCounts:
     def start_success(self) -> tuple[float, float, float]:
         """The same of EXPLOIT_AT_START rows."""
         return _ratio(self.start_successes, self.start_trials, self.start_trials)
+
+    def mix_f_score(self) -> tuple[float, float, float]:
+        """F1 on the published mix of rows, and its 95% interval over objects; NaN where it was not counted."""
+        return _ratio(2 * np.array(self.mix_hits), np.add(self.mix_claimed, self.mix_true), self.mix_true)
+
+    def shifted_f_score(self) -> tuple[float, float, float]:
+        """The same after the shift of the base rate."""
+        return _ratio(2 * np.array(self.shifted_hits), np.add(self.shifted_claimed, self.mix_true), self.mix_true)
+
+    def share_success(self) -> tuple[float, float, float]:
+        """The share of EXPLOIT_BY_SHARE rows that succeeded, and its 95% interval over objects; NaN where none are."""
+        return _ratio(self.share_successes, self.share_trials, self.share_trials)
+
+    def shares(self) -> dict[str, float]:
+        """All of these by name, and where their intervals begin and end."""
+        found: dict[str, float] = {}
+        for name in SHARES:
+            value, low, high = getattr(self, name)()
+            found |= {name: value, f"{name}_low": low, f"{name}_high": high}
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +136,16 @@ class EvaluationRow:
         sample_success_high: where it ends.
         start_success_low: where its 95% interval over objects begins.
         start_success_high: where it ends.
+        mix_f_score: as `f_score`, on the published mix of rows (see `learner.evaluation.published_mix`).
+        mix_f_score_low: where its 95% interval over objects begins.
+        mix_f_score_high: where it ends.
+        shifted_f_score: the same after logits are shifted by logit(`mix_base_rate`) - logit(`base_rate`).
+        shifted_f_score_low: where its 95% interval over objects begins.
+        shifted_f_score_high: where it ends.
+        share_success: share of the EXPLOIT_BY_SHARE rows that succeeded.
+        share_success_low: where its 95% interval over objects begins.
+        share_success_high: where it ends.
+        mix_base_rate: share of successes in the published mix of rows.
         counts: what these are of, by object.
     """
 
@@ -119,6 +168,16 @@ class EvaluationRow:
     sample_success_high: float
     start_success_low: float
     start_success_high: float
+    mix_f_score: float
+    mix_f_score_low: float
+    mix_f_score_high: float
+    shifted_f_score: float
+    shifted_f_score_low: float
+    shifted_f_score_high: float
+    share_success: float
+    share_success_low: float
+    share_success_high: float
+    mix_base_rate: float
     counts: ObjectCounts
 
 
@@ -154,7 +213,7 @@ def evaluate(
 ) -> list[EvaluationRow]:
     """One row for each method and budget that there are rows of.
 
-    Where2Act, AAP with no tries and the oracle, where there is one, have a row of their own at budget 0.
+    Where2Act, AAP with no tries and the oracle, where they are trained, have a row of their own at budget 0.
 
     Args:
         dataset: the interactions.
@@ -167,14 +226,14 @@ def evaluate(
         StoreError: there is no QUERY row, or the data set is of a task with another primitive than a policy's.
     """
     for policy in policies.values():
-        if policy.task != dataset.task and _primitive(policy.task) != _primitive(dataset.task):
+        primitive = _primitive(dataset.task) or dataset.primitive
+        if policy.task != dataset.task and _primitive(policy.task) not in (None, primitive):
             raise StoreError(f"the store is of task '{dataset.task}', but a policy of '{policy.task}'")
         policy.modules().eval()
     judge = _Judge(dataset, policies)
-    rows = [
-        judge.row(PRIOR_METHOD, 0, judge.critic("where2act", version)),
-        judge.row(NO_TRIES_METHOD, 0, judge.critic("aap", version)),
-    ]
+    rows = [judge.row(PRIOR_METHOD, 0, judge.critic("where2act", version))]
+    if "aap" in policies[version].trained:
+        rows.append(judge.row(NO_TRIES_METHOD, 0, judge.critic("aap", version)))
     if oracle is not None:
         rows.append(judge.row(ORACLE_METHOD, 0, OracleScores(oracle.eval(), judge.known)))
     for name in _methods(dataset):
@@ -212,6 +271,13 @@ class _Judge:
         self.queries = [index[rows.role[index.numpy()] == Role.QUERY.value] for index in dataset.rollouts]
         if not sum(map(len, self.queries)):
             raise StoreError("the store holds no query to judge by; evaluate on a store made by an evaluation plan")
+        self._success = rows.success.numpy() > THRESHOLD
+        self._asked = torch.cat(self.queries).numpy()
+        self._true = self._success[self._asked]
+        mix, asked = mix_for(dataset.primitive), [index.numpy() for index in self.queries]
+        self._weights = np.concatenate([mix.weights(self._success[own], rows.valid[own]) for own in asked])
+        all_weights = float(self._weights.sum())
+        self._mix_base_rate = float(self._weights[self._true].sum()) / all_weights if all_weights else float("nan")
         self._critics: dict[tuple[CriticName, int], RowCritic] = {}
         self._names = tuple(sorted(set(dataset.objects)))
         numbers = {name: number for number, name in enumerate(self._names)}
@@ -230,50 +296,46 @@ class _Judge:
         contexts = [self._context(index, method, budget) for index in self.dataset.rollouts]
         pairs = [pair for pair in zip(self.queries, contexts, strict=True) if len(pair[0])]
         scores = [critic(queries, context) for queries, context in pairs]
-        asked = torch.cat([queries for queries, _ in pairs])
-        labels = self.dataset.rows.success[asked].numpy()
         believed = torch.cat(scores).numpy()
-        found = discrimination(believed, labels)
-        counts = self._counts(method, budget, asked.numpy(), believed >= THRESHOLD, labels > THRESHOLD)
-        (f_score, f_low, f_high), (success, success_low, success_high) = counts.f_score(), counts.sample_success()
-        start, start_low, start_high = counts.start_success()
+        found = discrimination(believed, self._true)
+        shifted = believed >= shifted_threshold(found.base_rate, self._mix_base_rate)
+        counts = self._counts(method, budget, believed >= THRESHOLD, shifted)
         return EvaluationRow(
             task=self.dataset.task,
             method=method,
             budget=budget,
-            f_score=f_score,
             best_f_score=found.best_f_score,
             bce=found.bce,
             auc=found.auc,
             base_rate=found.base_rate,
             queries=found.rows,
-            sample_success=success,
-            start_success=start,
             trials=sum(counts.trials),
             mean_tries=float(np.mean([len(context) for _, context in pairs])),
-            f_score_low=f_low,
-            f_score_high=f_high,
-            sample_success_low=success_low,
-            sample_success_high=success_high,
-            start_success_low=start_low,
-            start_success_high=start_high,
+            mix_base_rate=self._mix_base_rate,
             counts=counts,
+            **counts.shares(),
         )
 
     def _counts(
         self,
         method: str,
         budget: int,
-        asked: NDArray[np.int64],
         claimed: NDArray[np.bool_],
-        true: NDArray[np.bool_],
+        shifted: NDArray[np.bool_],
     ) -> ObjectCounts:
-        success = self.dataset.rows.success.numpy() > THRESHOLD
+        """What a row counts; of each QUERY row, whether the critic called it a success, also after the shift."""
+        asked, true, success = self._asked, self._true, self._success
         chosen = self._exploits(Role.EXPLOIT, method, budget)
         at_start = chosen if method == PRIOR_METHOD else self._exploits(Role.EXPLOIT_AT_START, method, budget)
+        by_share = self._exploits(Role.EXPLOIT_BY_SHARE, method, budget)
+        executed = Role.EXPLOIT_BY_SHARE.value in self.dataset.rows.role
 
         def of_objects(rows: NDArray[np.int64]) -> tuple[int, ...]:
             return tuple(np.bincount(self._object_of[rows], minlength=len(self._names)).tolist())
+
+        def published_rows(chosen: NDArray[np.bool_]) -> tuple[float, ...]:
+            weights = self._weights[chosen]
+            return tuple(np.bincount(self._object_of[asked[chosen]], weights, len(self._names)).tolist())
 
         return ObjectCounts(
             object=self._names,
@@ -285,6 +347,13 @@ class _Judge:
             successes=of_objects(chosen[success[chosen]]),
             start_trials=of_objects(at_start),
             start_successes=of_objects(at_start[success[at_start]]),
+            mix_true=published_rows(true),
+            mix_claimed=published_rows(claimed),
+            mix_hits=published_rows(claimed & true),
+            shifted_claimed=published_rows(shifted),
+            shifted_hits=published_rows(shifted & true),
+            share_trials=of_objects(by_share) if executed else (),
+            share_successes=of_objects(by_share[success[by_share]]) if executed else (),
         )
 
     def _context(self, index: Tensor, method: str, budget: int) -> Tensor:

@@ -45,10 +45,13 @@ class ProposerKind:
         make: makes one of an `Adapter`, a random generator and the most tries that it may propose; where it needs no
             networks, there may be None in place of the adapter.
         modules: the networks that it needs; none: it proposes without a policy.
+        draw: likewise makes one that draws its points from a share of the cloud, the last argument, where that of
+            `make` takes the best; None: its points are not chosen so.
     """
 
     make: Callable[[Any, np.random.Generator, int], Proposer]
     modules: tuple[ModuleName, ...] = ()
+    draw: Callable[[Any, np.random.Generator, int, float], Proposer] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +121,11 @@ class Method:
         own = () if self.critic == "where2act" else (self.critic,)
         tried_by = () if self.tries is None or self.tries == RANDOM else PROPOSERS.get(self.tries).modules
         return tuple(dict.fromkeys(("prior", *own, *tried_by)))
+
+    @property
+    def draws_tries(self) -> bool:
+        """Whether its tries can be drawn from a share of the points; others are the same whatever the share."""
+        return self.tries in PROPOSERS.names() and PROPOSERS.get(str(self.tries)).draw is not None
 
     def policy_version(self, evaluated: int) -> int:
         """The policy version that it uses where version `evaluated` is evaluated."""

@@ -6,12 +6,13 @@ Everything here runs on the CPU in a few milliseconds a step and depends on its 
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.errors import UsageError
 from shared.policies.adaptation import Adapter, action_from_frame, movable_points
 from shared.policies.critics import best_action, critic_named, critic_names
 from shared.policies.methods import PROPOSERS, CriticName, ProposerKind
-from shared.types import Action, Interaction, Observation, Proposer
+from shared.types import Action, Float32, Interaction, Observation, Proposer
 
 TOP_POINTS = 100
 """Points that an exploit is drawn from (AdaAfford, Evaluation Metrics)."""
@@ -27,6 +28,9 @@ class AipProposer:
     rotations from the prior's proposal network. Stops when the budget is reached, or when the highest actionability is
     below the threshold (AdaAfford, Stopping Criterion).
 
+    With a `share`, the point is drawn from that share of the cloud's points, those with the highest AIP actionability:
+    the published code draws from the best 100 of 10,000 (AdaAffordCode, code/sample_succ.py, `while len(xs) < 100`).
+
     Deviation: `at_least` tries are made whatever the threshold says, since no history at all tells nothing.
     """
 
@@ -39,6 +43,7 @@ class AipProposer:
         budget: int,
         threshold: float = STOP_THRESHOLD,
         at_least: int = 1,
+        share: float | None = None,
     ) -> None:
         adapter.policy.require("prior", "aap", "aip")
         self.adapter = adapter
@@ -46,6 +51,7 @@ class AipProposer:
         self.budget = budget
         self.threshold = threshold
         self.at_least = at_least
+        self.share = share
 
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
         """The next action, or None to stop."""
@@ -56,13 +62,20 @@ class AipProposer:
         information = self.adapter.information(observation, candidates, latent)
         if len(history) >= self.at_least and float(information.max()) < self.threshold:
             return None
-        point = int(candidates[information.argmax()])
+        if self.share is None:
+            point = int(candidates[information.argmax()])
+        else:
+            point = drawn_point(candidates, information, points_of(self.share, observation), self.rng)
         proposals = self.adapter.proposals(observation, point, self.rng)
         best = int(self.adapter.information_proposals(observation, proposals, latent).argmax())
         return action_from_frame(observation, point, proposals.frames[best])
 
 
-AIP = ProposerKind(AipProposer, ("prior", "aap", "aip"))
+AIP = ProposerKind(
+    AipProposer,
+    ("prior", "aap", "aip"),
+    draw=lambda adapter, rng, budget, share: AipProposer(adapter, rng, budget, share=share),
+)
 
 
 class ExploitProposer:
@@ -70,25 +83,44 @@ class ExploitProposer:
 
     A random one of the 100 movable points with the highest actionability, and there the best by the critic of 100
     rotations from the prior's proposal network.
+
+    Published clouds have 10,000 points and ours fewer, so that 100 are a larger part of them: with a `share`, the point
+    is one of that share of the cloud's points, 0.01 as published (AdaAffordCode, code/sample_succ.py).
     """
 
-    def __init__(self, adapter: Adapter, rng: np.random.Generator, critic: CriticName = "aap") -> None:
+    def __init__(
+        self, adapter: Adapter, rng: np.random.Generator, critic: CriticName = "aap", share: float | None = None
+    ) -> None:
         self.name = critic
         self.critic = critic_named(critic, adapter)
         self.adapter = adapter
         self.rng = rng
+        self.share = share
 
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
         """The action to execute; never None."""
         candidates = movable_points(observation)
         scores = self.critic.affordance(observation, candidates, history)
-        # A stable sort makes the choice among equal scores independent of the machine.
-        best_first = candidates[np.argsort(-scores, kind="stable")]
-        point = int(self.rng.choice(best_first[:TOP_POINTS]))
+        count = TOP_POINTS if self.share is None else points_of(self.share, observation)
+        point = drawn_point(candidates, scores, count, self.rng)
         return best_action(self.critic, self.adapter, observation, point, history, self.rng)
 
 
-def proposer_named(name: str, adapter: Adapter | None, rng: np.random.Generator, budget: int) -> Proposer:
+def points_of(share: float, observation: Observation) -> int:
+    """How many points a share of a cloud is, at least one; of all points, since the published 100 are of 10,000."""
+    return max(1, round(share * len(observation.points)))
+
+
+def drawn_point(candidates: NDArray[np.int64], scores: Float32, count: int, rng: np.random.Generator) -> int:
+    """One of the `count` candidates with the highest scores, at random; `candidates` and `scores`: [C]."""
+    # A stable sort makes the choice among equal scores independent of the machine.
+    best_first = candidates[np.argsort(-scores, kind="stable")]
+    return int(rng.choice(best_first[:count]))
+
+
+def proposer_named(
+    name: str, adapter: Adapter | None, rng: np.random.Generator, budget: int, share: float | None = None
+) -> Proposer:
     """The proposer that rows call `name`.
 
     Args:
@@ -96,6 +128,7 @@ def proposer_named(name: str, adapter: Adapter | None, rng: np.random.Generator,
         adapter: the policy; None where the proposer needs none.
         rng: draws what it draws.
         budget: how many tries it may propose.
+        share: of a cloud's points, from which its points are drawn, as far as it draws any; None: its own way.
 
     Raises:
         UsageError: there is none of that name, or the networks that it needs are not trained.
@@ -104,8 +137,10 @@ def proposer_named(name: str, adapter: Adapter | None, rng: np.random.Generator,
         kind = PROPOSERS.get(name)
         if adapter is not None:
             adapter.policy.require(*kind.modules)
+        if share is not None and kind.draw is not None:
+            return kind.draw(adapter, rng, budget, share)
         return kind.make(adapter, rng, budget)
     if name in critic_names() and adapter is not None:
-        return ExploitProposer(adapter, rng, name)
+        return ExploitProposer(adapter, rng, name, share)
     known = ", ".join((*PROPOSERS.names(), *critic_names()))
     raise UsageError(f"no proposer is called '{name}'; allowed: {known}")

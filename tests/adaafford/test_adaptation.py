@@ -14,7 +14,7 @@ from shared.policies.adaptation import (
     movable_points,
 )
 from shared.policies.policy import Policy
-from shared.policies.proposers import AipProposer, ExploitProposer
+from shared.policies.proposers import TOP_POINTS, AipProposer, ExploitProposer, points_of
 from shared.types import Action, Interaction, Proposer
 from tests.support.small_networks import TINY
 from tests.support.small_policies import history_of, observation_of, policy_of
@@ -83,6 +83,29 @@ def test_an_exploit_is_among_the_hundred_best_points(adapter: Adapter) -> None:
         action = exploit.propose(observation, [])
         assert action is not None
         assert action.point_index in best
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.01, 6), (0.001, 1), (0.0126, 8), (1.0, 600)])
+def test_a_share_draws_points_from_the_best_of_the_whole_cloud(adapter: Adapter, share: float, count: int) -> None:
+    observation = observation_of(points=600)
+    candidates, rng = movable_points(observation), np.random.default_rng(2)
+    proposers = {
+        "exploit": (ExploitProposer(adapter, rng, share=share), adapter.affordance(observation, [])[candidates]),
+        "aip": (
+            AipProposer(adapter, rng, budget=99, share=share),
+            adapter.information(observation, candidates, adapter.z([])),
+        ),
+    }
+    for proposer, scores in proposers.values():
+        best = set(candidates[np.argsort(-scores, kind="stable")[:count]])
+        drawn = {action.point_index for _ in range(6) if (action := proposer.propose(observation, [])) is not None}
+        assert drawn <= best
+        assert len(drawn) > 1 or count == 1
+
+
+def test_a_share_of_a_published_cloud_is_the_published_number_of_points() -> None:
+    cloud = dataclasses.replace(observation_of(), points=np.zeros((10_000, 3), np.float32))
+    assert points_of(0.01, cloud) == TOP_POINTS == 100
 
 
 def test_without_a_movable_point_nothing_is_proposed(adapter: Adapter) -> None:

@@ -46,6 +46,11 @@ def counts_of(rng: np.random.Generator, objects: tuple[str, ...]) -> dict[str, l
         "successes": rng.binomial(trials, 0.6),
         "start_trials": trials,
         "start_successes": rng.binomial(trials, 0.5),
+        "mix_true": 1.5 * true,
+        "mix_claimed": 1.5 * true + 0.5,
+        "mix_hits": 1.5 * claimed_true,
+        "shifted_claimed": 1.5 * true + 0.25,
+        "shifted_hits": 1.5 * claimed_true,
     }
     return {"object": list(objects)} | {name: column.tolist() for name, column in columns.items()}
 
@@ -100,6 +105,10 @@ def test_figures_are_of_all_trials_and_intervals_of_objects(
     successes = [one["successes"][0], two["successes"][0], one["successes"][1] + two["successes"][1]]
     trials = [one["trials"][0], two["trials"][0], one["trials"][1] + two["trials"][1]]
     assert row.shares["sample_success"][1:] == pytest.approx(ratio_interval(successes, trials, [0, 1, 2]))
+    weighed = {name: sum(one[name]) + sum(two[name]) for name in ("mix_hits", "mix_claimed", "mix_true")}
+    expected = 2 * weighed["mix_hits"] / (weighed["mix_claimed"] + weighed["mix_true"])
+    assert row.shares["mix_f_score"][0] == pytest.approx(expected)
+    assert row.shares["mix_f_score"][1] <= expected <= row.shares["mix_f_score"][2]
     assert found.objects == 3
     assert found.base_rate == pytest.approx(0.3)
     assert row.by_run["sample_success"][1] == pytest.approx(sum(two["successes"]) / sum(two["trials"]))
@@ -113,7 +122,8 @@ def test_the_files_hold_it(runs: tuple[list[Path], object], tmp_path: Path) -> N
     found: Comparison = pool(runs[0], None)
     write_comparison(tmp_path / "out", found)
     text = (tmp_path / "out" / MARKDOWN_FILE).read_text()
-    assert "*77.4*" in text  # The paper's F-score of ours-final after one try.
+    assert text.count("*77.4*") == 3  # The paper's F-score of ours-final after one try, also beside the mix.
+    assert "| method | tries | F, published mix | paper | F, published mix, shifted | paper |" in text
     assert "seed 0 | seed 1" in text
     read = list(csv.DictReader((tmp_path / "out" / CSV_FILE).read_text().splitlines()))
     assert [row["method"] for row in read] == ["where2act", "ours-final", "oracle"]
@@ -122,6 +132,47 @@ def test_the_files_hold_it(runs: tuple[list[Path], object], tmp_path: Path) -> N
     assert "paper_start_success" not in read[0]
     assert json.loads((tmp_path / "out" / JSON_FILE).read_text())["seeds"] == [0, 1]
     assert (tmp_path / "out" / FIGURE_FILE).read_bytes().startswith(b"\x89PNG")
+
+
+def test_results_of_older_versions_are_pooled_without_the_published_mix(
+    runs: tuple[list[Path], object], tmp_path: Path
+) -> None:
+    path = runs[0][0] / "training" / "evaluate" / RESULTS_FILE
+    document = json.loads(path.read_bytes())
+    for row in document["rows"]:
+        row["counts"] = {name: each for name, each in row["counts"].items() if not name.startswith(("mix", "shifted"))}
+    path.write_text(json.dumps(document))
+    found = pool(runs[0], None)
+    row = found.rows[1]
+    assert not np.isnan(row.shares["f_score"][0])
+    assert np.isnan(row.shares["mix_f_score"]).all()
+    assert [np.isnan(each) for each in row.by_run["mix_f_score"]] == [True, False]
+    assert "published mix" not in as_markdown(found)
+    write_comparison(tmp_path / "out", found)
+    assert json.loads((tmp_path / "out" / JSON_FILE).read_bytes())["rows"][1]["mix_f_score"] is None
+
+
+def test_exploits_by_share_are_pooled_where_all_runs_have_the_same_share(
+    runs: tuple[list[Path], object],
+) -> None:
+    def tell(run: Path, share: float | None, counted: dict[str, list[int]]) -> None:
+        path = run / "training" / "evaluate" / RESULTS_FILE
+        document = json.loads(path.read_bytes()) | {"exploit_share": share}
+        for row in document["rows"]:
+            row["counts"] |= counted
+        path.write_text(json.dumps(document))
+
+    one, two = runs[0]
+    counted = {"share_trials": [4, 4], "share_successes": [1, 2]}
+    tell(one, 0.01, counted)
+    assert np.isnan(pool(runs[0], None).rows[1].shares["share_success"][0])
+    tell(two, 0.01, counted)
+    found = pool(runs[0], None)
+    assert found.rows[1].shares["share_success"][0] == pytest.approx(6 / 16)
+    assert "drawn from the best 1% of the cloud" in as_markdown(found)
+    tell(two, 0.05, counted)
+    with pytest.raises(UsageError, match=r"different exploit_share \(0\.01, 0\.05\)"):
+        pool(runs[0], None)
 
 
 def test_novel_categories_stand_beside_the_papers_figures_of_such(tmp_path: Path) -> None:
@@ -176,6 +227,7 @@ def test_what_cannot_be_pooled_is_said_in_a_line(
     path = runs[0][0] / "training" / "evaluate" / RESULTS_FILE
     whole = path.read_text()
     for damage, message in (("7, ", "different lengths"), ("-", "not between 0")):
-        path.write_text(whole.replace('"queries": [', f'"queries": [{damage}'))
-        with pytest.raises(UsageError, match=message):
-            pool(runs[0], None)
+        for name in ("queries", "mix_true"):
+            path.write_text(whole.replace(f'"{name}": [', f'"{name}": [{damage}'))
+            with pytest.raises(UsageError, match=message):
+                pool(runs[0], None)

@@ -70,6 +70,16 @@ def test_cost_grows_with_what_is_asked_for() -> None:
     assert stage(all_methods, "evaluate").core_s > 3 * stage(some, "evaluate").core_s
 
 
+def test_a_share_costs_an_action_at_each_budget_and_aip_its_tries_again() -> None:
+    def evaluated(**told: object) -> int:
+        methods = {"methods": ["where2act", "ours-random", "ours-final"], "budgets": [1, 4]}
+        config = CampaignConfig.model_validate({"task": "push", "evaluation": methods | told})
+        return stage(estimate(config), "evaluate").interactions
+
+    trials = CampaignConfig().rollouts.evaluation
+    assert evaluated(exploit_share=0.01) - evaluated() == trials * (3 * 2 + 4)
+
+
 def test_rates_are_of_their_stages_alone() -> None:
     config = CampaignConfig(task="pull")
     slow = dataclasses.replace(RATES, pull_s=10 * RATES.pull_s)

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import io
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from cluster.cli.main import run as adaafford
 from cluster.config.evaluation_settings import EvaluateSettings
 from cluster.evaluation.evaluate import PROPOSER, Evaluation
 from cluster.evaluation.policy_evaluation import evaluate_policy
-from cluster.evaluation.run_evaluation import evaluate_run
+from cluster.evaluation.run_evaluation import evaluate_run, evaluate_without_run
 from cluster.evaluation.tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
 from cluster.workers.retries import JobError
 from cluster.workers.session import Crew
@@ -24,12 +25,14 @@ from collector.worker import Worker
 from learner.evaluation.bootstrap import ratio_interval
 from learner.evaluation.table import EvaluationRow, ObjectCounts
 from learner.metrics import f_score
+from learner.stages.jobs import DONE_FILE
 from shared.errors import UsageError
 from shared.formatting import csv_table
 from shared.plan import EvaluationConfig, Plan, Setting
 from shared.policies.methods import METHODS
+from shared.policies.policy import WEIGHTS_FILE, Policy
 from shared.store import Store
-from tests.support.finished_run import make_finished_run
+from tests.support.finished_run import SMALL_NETWORK, make_finished_run
 
 FAST = EvaluateSettings(methods=("where2act", "ours-random"), budgets=(1,), trials=2, queries=4, per_shard=1, workers=0)
 
@@ -76,14 +79,24 @@ def table_of(**values: object) -> EvaluationTable:
         **{"sample_success": None, "sample_success_low": None, "sample_success_high": None, "trials": 0},
         **{"start_success": 0.4, "start_success_low": 0.2, "start_success_high": 0.6, "counts": {"object": ["a"]}},
         **{"best_f": 0.6, "bce": 0.5, "auc": None, "base_rate": 0.3, "mean_tries": 2.0, "gap_closed": None},
+        **{"mix_f_score": 0.8, "mix_f_score_low": 0.7, "mix_f_score_high": 0.9, "mix_base_rate": 0.45},
+        **{"shifted_f_score": None, "shifted_f_score_low": None, "shifted_f_score_high": None},
+        **{"share_success": None, "share_success_low": None, "share_success_high": None},
     }
-    return EvaluationTable("push-faucet", 1, 4, 40, 2, "ab" * 32, {"a": "cd" * 32}, (row | values,))
+    share = 0.01 if "share_success" in values else None
+    return EvaluationTable("push-faucet", 1, 4, 40, 2, share, "ab" * 32, {"a": "cd" * 32}, (row | values,))
 
 
 def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     shown = as_markdown(table_of())
     assert "| ours-final | 2 | 50.0 [25.0, 75.0] | - | 40.0 [20.0, 60.0] | - | 0 |" in shown
+    assert "| 2 | 80.0 [70.0, 90.0] |\n" in shown  # Like-for-like columns stand last, where there are figures.
+    assert "best share" not in shown.lower()
+    both = as_markdown(table_of(share_success=0.25, share_success_low=0.1, share_success_high=0.5))
+    assert "| 80.0 [70.0, 90.0] | 25.0 [10.0, 50.0] |\n" in both
+    assert "drawn from the best 1% of the cloud" in both
     assert "30.0% succeed" in shown
+    assert "of which 45.0% succeed" in shown
     read = list(csv.DictReader(io.StringIO(csv_table(table_of().rows, ["counts"]))))
     assert (read[0]["f_score"], read[0]["auc"]) == ("0.5", "")
     assert "counts" not in read[0]
@@ -131,7 +144,7 @@ def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) 
     told = {**dict(store.setting), "kind": "evaluation", "evaluation": EvaluationConfig(methods=("where2act",))}
     evaluation = Store.create(tmp_path / "store", Setting(**told))
     evaluation.add_plan(Plan(setting=evaluation.setting, proposer=PROPOSER, policy_version=7))
-    wanted = Evaluation(evaluation, store, 1, 2, 1, finished / "objects", tmp_path, tmp_path)
+    wanted = Evaluation(evaluation, store.read_policy, 1, 2, 1, finished / "objects", *[tmp_path] * 3)
     with pytest.raises(UsageError, match="trials of another policy"):
         wanted.execute(Crew(lambda *_: pytest.fail("a worker group was asked for")), print)
 
@@ -164,9 +177,13 @@ def test_what_does_not_suit_is_refused_in_one_line(
     generate(tmp_path / "boxes", {"Box": 1}, seed=1)
     for arguments, expected in (
         (["--run", str(tmp_path / "gone")], "holds no run"),
-        (["--run", str(finished), "--policy", "7"], "there is no policy 7; published: 1"),
-        (["--run", str(finished), "--task", "pull"], "the run is trained to push"),
+        (["--run", str(finished), "--policy-version", "7"], "there is no policy 7; published: 1"),
+        (["--run", str(finished), "--policy", "7"], "give either --run RUN or --policy POLICY; given: both"),
+        ([], "give either --run RUN or --policy POLICY; given: neither"),
+        (["--run", str(finished), "--task", "pull"], "the policy is trained to push"),
+        (["--run", str(finished), "--collection.camera.points", "99"], "--collection settings are for --policy"),
         (["--run", str(finished), "--budgets", "0"], "budgets"),
+        (["--run", str(finished), "--exploit-share", "0"], "exploit_share"),
         (["--run", str(finished), "--task", "pusk"], "unknown task 'pusk'"),
         (["--run", str(finished), "--objects", str(tmp_path / "boxes")], "suits the task 'push-faucet'"),
     ):
@@ -192,6 +209,121 @@ def test_what_was_trained_on_is_never_tested_on(
     for objects in (None, finished / "objects"):
         evaluate_run(finished, FAST.model_copy(update={"objects": objects}), tmp_path / f"out-{objects is None}")
     assert [[ref.id for ref in refs] for refs in tested] == [[ref["id"] for ref in used["test"]]] * 2
+
+
+# A policy without a run
+
+
+@pytest.fixture(scope="module")
+def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run's policy alone, in a folder that says that it has seen the first of the run's test objects."""
+    folder = tmp_path_factory.mktemp("exported") / "policy"
+    folder.mkdir()
+    for name, data in Store.open(finished / "store").read_policy(1).items():
+        (folder / name).write_bytes(data)
+    first = json.loads((finished / "objects.json").read_bytes())["test"][0]
+    (folder / DONE_FILE).write_text(json.dumps({"stage": "exported", "objects": [first["content_hash"]]}))
+    return folder
+
+
+@pytest.mark.parametrize("named", ["folder", "file"])
+def test_evaluate_policy_without_run_tests_all_objects_but_those_it_has_seen(
+    named: str, finished: Path, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluations = []
+
+    def pretend(evaluation: Evaluation, _: EvaluateSettings) -> None:
+        evaluations.append(evaluation)
+        (evaluation.out / MARKDOWN_FILE).write_text("")
+
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._execute", pretend)
+    monkeypatch.chdir(tmp_path)
+    source = exported if named == "folder" else exported / WEIGHTS_FILE
+    for trials in (1, 2):  # More trials of the same go on in the same folder.
+        told = FAST.model_copy(update={"objects": finished / "objects", "methods": (), "trials": trials})
+        evaluate_without_run(str(source), told, None)
+    one, more = evaluations
+    used = json.loads((finished / "objects.json").read_bytes())
+    wanted = {ref["id"] for ref in (*used["train"], *used["test"][1:])}
+    assert {ref.id for ref in one.store.setting.objects} == wanted
+    assert one.out == more.out
+    assert one.out.parent == Path("evaluations")
+    assert one.out.name.startswith("push-faucet-objects-policy-")
+    # The first policy of the run is not known, so the method that uses it is left out.
+    assert set(one.config.methods) == {"where2act", *(name for name in METHODS.names() if name.startswith("ours-"))} - {
+        "ours-no-iteration"
+    }
+
+
+def test_evaluate_policy_says_where_its_objects_cannot_be_known(
+    finished: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lone = tmp_path / "lone"
+    shutil.copytree(exported, lone)
+    (lone / DONE_FILE).unlink()
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda *_: None)
+    for source, said in ((lone, 1), (exported, 0)):
+        evaluate_without_run(str(source), FAST.model_copy(update={"objects": finished / "objects"}), None)
+        assert capsys.readouterr().err.count("does not say what objects it has learned from") == said
+
+
+def test_evaluate_policy_with_a_run_is_the_evaluation_of_the_run(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = []
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda subject, *_: told.append(subject))
+    evaluate_run(finished, FAST, None)
+    evaluate_without_run(str(finished), FAST, None)
+    assert len({(subject.label, subject.evaluations, subject.root) for subject in told}) == 1
+
+
+def test_evaluate_policy_refuses_what_does_not_suit_in_one_line(
+    finished: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "untrained").mkdir()
+    for name, data in Policy.untrained("push", SMALL_NETWORK, 0).to_files().items():
+        (tmp_path / "untrained" / name).write_bytes(data)
+    where = ["--objects", str(finished / "objects")]
+    for arguments, expected in (
+        (["no-such-policy", *where], "no policy 'no-such-policy': give a name"),
+        (["push-faucet"], "brings no test objects; name a folder with --objects"),
+        ([str(exported), *where, "--policy-version", "1"], "--policy-version is for --run"),
+        ([str(exported), *where, "--methods", "ours-no-iteration"], "uses an earlier policy of a run"),
+        ([str(exported), *where, "--task", "pull"], "the policy is trained to push"),
+        ([str(exported), *where, "--collection.primitive", "pull"], "needs pull; name a task of the same primitive"),
+        ([str(tmp_path / "untrained"), *where], "none of its networks is trained"),
+        ([str(exported), "--objects", str(tmp_path / "gone")], "gone"),
+    ):
+        assert adaafford(["evaluate", "--policy", *arguments, "--workers", "0", "--out", str(tmp_path / "out")]) == 2
+        lines = capsys.readouterr().err
+        assert expected in lines
+        assert lines.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_evaluate_policy_without_run_writes_the_table_and_never_mixes_policies(
+    finished: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--objects", str(finished / "objects"), "--methods", "where2act", "--budgets", "1", "--trials", "1"]
+    flags += ["--exploit-share", "0.01", "--queries", "2", "--workers", "0", "--out", str(tmp_path / "out")]
+    flags += ["--collection.camera.points", "256", "--collection.camera.image-size", "128"]
+    assert adaafford(["evaluate", "--policy", str(exported), *flags]) == 0
+    assert "| where2act | 1 |" in capsys.readouterr().out
+    found = json.loads((tmp_path / "out" / RESULTS_FILE).read_bytes())
+    assert found["rollouts"] == found["objects"] == 3
+    assert {row["method"] for row in found["rows"]} == {"where2act", "aap-no-tries"}  # No oracle came along.
+    assert all("mix_f_score" in row and "shifted_f_score_low" in row for row in found["rows"])
+    shares = {row["method"]: row["share_success"] for row in found["rows"]}
+    assert shares["where2act"] is not None
+    assert shares["aap-no-tries"] is None
+    other = tmp_path / "other"
+    shutil.copytree(exported, other)
+    policy = Policy.untrained("push-faucet", SMALL_NETWORK, seed=8).with_trained("prior").with_trained("aap")
+    for name, data in policy.to_files().items():
+        (other / name).write_bytes(data)
+    assert adaafford(["evaluate", "--policy", str(other), *flags]) == 2
+    assert "holds trials of another policy; name another folder" in capsys.readouterr().err
 
 
 @pytest.mark.slow

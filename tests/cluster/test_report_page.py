@@ -26,7 +26,7 @@ from cluster.reporting.collecting import wilson
 from cluster.reporting.counterfactuals import Counterfactuals, hinge_twins, variations
 from cluster.reporting.failures import FailedExploit, varied
 from cluster.reporting.page import MAX_TEXT, Drawing, Page, Section, plain, render, shortened
-from cluster.reporting.results import Results, table_of
+from cluster.reporting.results import Results, like_for_like, table_of
 from cluster.reporting.training import after_tries, curves_of, read_entries
 from cluster.runs.run_folder import ObjectsUsed, RunFolder, begin
 from cluster.runs.run_log import RunLog
@@ -350,6 +350,17 @@ def test_a_task_that_the_paper_lacks_has_no_columns_of_it() -> None:
     table = table_of(Results("another", (row_of("ours-final", 1),)))
     assert [len(row) for row in table.body] == [4]
     assert sum(cell.span for cell in table.head[0]) == len(table.head[1]) == 4
+
+
+def test_what_was_measured_as_in_the_paper_stands_in_a_table_beside_it() -> None:
+    row = row_of("ours-final", 1)
+    assert like_for_like(Results("push-faucet", (row,))) == ()  # Files of older versions.
+    measured = {"mix_f_score": 0.8, "mix_f_score_low": 0.7, "mix_f_score_high": 0.9, "mix_base_rate": 0.45}
+    (table,) = like_for_like(Results("push-faucet", (row.model_copy(update=measured),)))
+    assert [cell.text for cell in table.head[0]] == ["method", "F, published mix"]
+    (cells,) = table.body
+    assert [(cell.text, cell.note) for cell in cells[1:]] == [("80.0", "70\u201390"), ("77.4", "")]
+    assert "45.0% succeed" in table.caption
 
 
 # Curves and statistics

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from collector.domain_randomisation import draw_rollout, object_of
 from collector.objects.articulation import ArticulatedObject
@@ -53,7 +54,7 @@ class Named(RandomProposer):
         return super().propose(observation, history)
 
 
-def no_policy(name: str, rng: np.random.Generator, version: int) -> Proposer:
+def no_policy(name: str, rng: np.random.Generator, version: int, share: float | None = None) -> Proposer:
     return Named(name, rng)
 
 
@@ -217,6 +218,40 @@ def test_evaluation_gives_every_method_the_same_start_and_the_same_questions(obj
         assert all(np.array_equal(row.joint_positions, queries[0].joint_positions) for row in again)
         assert {row.proposer for row in tries} <= {"random", "aip"}
         assert {row.proposer for row in exploits} == {"where2act" if method == "where2act" else "aap"}
+
+
+@pytest.mark.usefixtures("fake")
+def test_evaluation_by_share_comes_last_and_leaves_all_other_rows_as_they_are(objects: Path) -> None:
+    evaluation = EvaluationConfig(methods=("where2act", "ours-random", "ours-final"), budgets=(1, 2), queries=3)
+    by_share = evaluation.model_copy(update={"exploit_share": 0.01})
+    natural, both = (
+        rollout(plan_for(objects, kind="evaluation", evaluation=told, collection=FAKE), objects)
+        for told in (evaluation, by_share)
+    )
+    count = len(natural.interactions)
+    for row, same in zip(natural.interactions, both.interactions[:count], strict=True):
+        assert (row.step, row.role, row.method, row.budget) == (same.step, same.role, same.method, same.budget)
+        assert np.array_equal(row.action.rotation, same.action.rotation)
+        assert row.outcome.end_joint_position == same.outcome.end_joint_position
+    start, more = natural.interactions[0].joint_positions, both.interactions[count:]
+    context, exploit = Role.CONTEXT_BY_SHARE, Role.EXPLOIT_BY_SHARE
+    # AIP alone draws its tries anew; the others are told what they have tried.
+    assert [(row.method, row.role, row.budget) for row in more] == [
+        *(("where2act", exploit, budget) for budget in (1, 2)),
+        *(("ours-random", exploit, budget) for budget in (1, 2)),
+        *(("ours-final", context, -1) for _ in range(2)),
+        *(("ours-final", exploit, budget) for budget in (1, 2)),
+    ]
+    assert all(np.array_equal(row.joint_positions, start) for row in more if row.role is exploit)
+
+
+def test_a_setting_without_a_share_is_the_document_that_it_was() -> None:
+    assert "exploit_share" not in EvaluationConfig().model_dump_json()
+    told = EvaluationConfig(exploit_share=0.01)
+    assert EvaluationConfig.model_validate_json(told.model_dump_json()) == told
+    for wrong in (0.0, 1.5, -0.01):
+        with pytest.raises(ValidationError, match="exploit_share"):
+            EvaluationConfig(exploit_share=wrong)
 
 
 @pytest.mark.usefixtures("fake")

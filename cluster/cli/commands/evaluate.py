@@ -1,4 +1,4 @@
-"""`adaafford evaluate`: the paper's table of a finished run, on its own test objects or on any others."""
+"""`adaafford evaluate`: the paper's table of a finished run or of any policy, on test objects or on any others."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +8,7 @@ import tyro
 
 from cluster.config.evaluation_settings import EvaluateSettings
 from cluster.config.flags import parse_flags
+from shared.errors import UsageError
 from shared.policies.methods import method_named
 
 
@@ -19,20 +20,31 @@ class EvaluateCommand:
     """
 
     settings: Annotated[EvaluateSettings, tyro.conf.arg(name="")]
-    run: Path
+    run: Path | None = None
     """Folder of a run that has published a policy."""
+    policy: str | None = None
+    """Instead of a run: a name of the policies that the package brings, a folder with policy.json, or a file there."""
     out: Path | None = None
-    """Folder for the trials and the table; where none is given, one below RUN/evaluations that the settings name."""
+    """Folder for the trials and the table; where none is given, one that the settings name, below RUN/evaluations or,
+    without a run, below evaluations/ in the working folder."""
 
 
 def main(args: list[str]) -> int:
     """Evaluate."""
-    command = parse_flags(EvaluateCommand, args, "evaluate", EvaluateCommand(EvaluateSettings(), tyro.MISSING))
+    command = parse_flags(EvaluateCommand, args, "evaluate", EvaluateCommand(EvaluateSettings()))
+    if (command.run is None) == (command.policy is None):
+        given = "both" if command.run is not None else "neither"
+        raise UsageError(
+            f"give either --run RUN or --policy POLICY; given: {given} (--policy-version names one of a run's policies)"
+        )
     if command.settings.task is not None:
         _ = command.settings.task_record
     for method in command.settings.methods:
         method_named(method)
-    from cluster.evaluation.run_evaluation import evaluate_run
+    from cluster.evaluation.run_evaluation import evaluate_run, evaluate_without_run
 
-    evaluate_run(command.run, command.settings, command.out)
+    if command.run is not None:
+        evaluate_run(command.run, command.settings, command.out)
+    elif command.policy is not None:
+        evaluate_without_run(command.policy, command.settings, command.out)
     return 0
