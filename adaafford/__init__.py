@@ -8,6 +8,7 @@ A robot's author implements `Environment` over a camera and an arm, and lets the
 ...     history.append(Interaction(observation, action, robot.execute(action)))
 >>> heat = adapter.affordance(robot.observe(), history)      # [N], where the part can be moved
 
+`open_store` reads what was collected: tables, clouds, and by `InteractionDataset` samples for PyTorch.
 `collect` and `train` do what the commands of these names do; `simulated` gives simulated objects to try a policy on.
 Collecting and simulating need `pip install 'adaafford[collect]'`; nothing of that is imported before they are used.
 """
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from shared.policies.policy import Policy
     from shared.policies.proposers import AipProposer, ExploitProposer
     from shared.store import Store
+    from shared.store.streaming import InteractionDataset
     from shared.types import (
         Action,
         Environment,
@@ -54,6 +56,7 @@ else:
         "shared.policies.policy": ("Policy",),
         "shared.policies.proposers": ("AipProposer", "ExploitProposer"),
         "shared.store": ("Store",),
+        "shared.store.streaming": ("InteractionDataset",),
         "shared.types": (
             *("Action", "Environment", "Interaction", "Observation"),
             *("Outcome", "OutcomeKind", "Proposer"),
@@ -83,6 +86,7 @@ __all__ = [
     "Environment",
     "ExploitProposer",
     "Interaction",
+    "InteractionDataset",
     "Observation",
     "Outcome",
     "OutcomeKind",

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from cluster.cli.commands.bench import BenchSettings, flags_of, run_benchmark
-from cluster.cli.main import begin_process, guarded
+from cluster.cli.main import begin_process, guarded, only_prints
 from cluster.config.flags import parse_flags
 from shared.errors import UsageError
 
@@ -27,8 +27,9 @@ def run_script(name: str, settings: type[Settings], measure: Measure[Settings], 
 
 def main(name: str, settings: type[Settings], measure: Measure[Settings]) -> NoReturn:
     """Run the benchmark of this process and exit."""
-    streams = begin_process(stop_at_pipe=True)
-    sys.exit(streams.settle(run_script(name, settings, measure, sys.argv[1:])))
+    args = sys.argv[1:]
+    streams = begin_process(stop_at_pipe=only_prints(args))
+    sys.exit(streams.settle(run_script(name, settings, measure, args)))
 
 
 def check_picture(flag: str, path: Path | None) -> None:

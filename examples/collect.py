@@ -35,7 +35,7 @@ for found in rows.group_by("outcome").aggregate([("success", "count")]).to_pylis
 rollouts = store.rollouts()
 print(f"{rollouts.num_rows} rollouts: {', '.join(rollouts.column_names)}")
 
-# The column `shard` names the part of the store with the clouds O of a row; `observation` is the cloud's number there.
-last = rows.slice(rows.num_rows - 1).to_pylist()[0]
-clouds = store.read_observations(last["shard"])
-print(f"p = {last['point']} is point {last['point_index']} of a cloud {clouds.points[last['observation']].shape}")
+# The cloud O of each row; `examples/look.py` shows more of a store.
+last = rows.slice(rows.num_rows - 1)
+point, index, cloud = last["point"][0].as_py(), last["point_index"][0].as_py(), store.clouds(last).points[0]
+print(f"p = {point} is point {index} of a cloud {cloud.shape}")

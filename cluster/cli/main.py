@@ -63,7 +63,7 @@ NEEDS = {
 """Extras without which a command would fail, perhaps after hours; what only some of its uses need is not among them."""
 
 RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate")
-"""Long work, which goes on when nobody reads its output any more."""
+"""Long work, with which the same command goes on after an interruption."""
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells more\n\n" + "\n".join(
     f"  {name:<15}{text}" for name, text in COMMANDS.items()
@@ -73,12 +73,19 @@ USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells 
 def main() -> NoReturn:
     """Run the command line of this process and exit."""
     args = sys.argv[1:]
-    streams = begin_process(stop_at_pipe=not args or args[0] not in RESUMABLE)
+    streams = begin_process(stop_at_pipe=only_prints(args))
     try:
         code = run(args)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else _complain(str(stop.code), 1) if stop.code else 0
     sys.exit(streams.settle(code))
+
+
+def only_prints(args: list[str]) -> bool:
+    """Whether a command line leaves nothing but its output, so that it can end where nobody reads that any more."""
+    if {"-h", "--help", "--dry-run"}.intersection(args):
+        return True
+    return not (args and args[0] in RESUMABLE) and not any(arg.partition("=")[0] == "--out" for arg in args)
 
 
 def begin_process(*, stop_at_pipe: bool = False) -> Streams:
@@ -140,9 +147,6 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
         return _complain(missing_line(f"adaafford {args[0]} here", str(error.name)), UsageError.exit_code)
     except KeyboardInterrupt:
         return _interrupted(args)
-    except BrokenPipeError:
-        # Whoever read our output has enough (`adaafford ... | head`).
-        return 128 + signal.SIGPIPE
     except OSError as error:
         logger.info("what the system refused", exc_info=True)
         place = f"{error.filename}: " if error.filename else ""

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 STDIN, STDOUT, STDERR = 0, 1, 2
+PIPE_CLOSED = 128 + signal.SIGPIPE
+"""Exit code where the reader of the output has gone, as a shell has it for `cat` and `yes`; with `set -o pipefail` a
+script can tell it from success, which 0 would not allow."""
 MIN_COLUMNS, MAX_COLUMNS = 40, 1000
 """Narrower help and tables could not be read, and laying them out may never end; wider ones are mostly blanks."""
 
@@ -29,7 +32,8 @@ class Sink(io.RawIOBase):
     Args:
         descriptor: of a standard stream.
         closed: whether it was not open when the process began.
-        stop_at_pipe: whether to raise BrokenPipeError, once, where nobody reads any more.
+        stop_at_pipe: whether to end the command where nobody reads any more, by a SystemExit that is raised once. Many
+            catch an OSError, for which they would blame the disk, and rich ends with a code of its own for it.
     """
 
     def __init__(self, descriptor: int, *, closed: bool, stop_at_pipe: bool) -> None:
@@ -61,7 +65,7 @@ class Sink(io.RawIOBase):
         except BrokenPipeError as error:
             first, self.lost = self.lost is None, self.lost or error
             if first and self._stop_at_pipe:
-                raise
+                raise SystemExit(PIPE_CLOSED) from None
         except OSError as error:
             self.lost = self.lost or error
         return whole
@@ -90,13 +94,13 @@ class Streams:
 
     def settle(self, code: int) -> int:
         """The exit code of the process, given that of its command; says so where output was lost."""
-        with suppress(BrokenPipeError):
+        with suppress(SystemExit):
             sys.stdout.flush()
         lost = self._out.lost
         if lost is None or code != 0:
             return code
         if isinstance(lost, BrokenPipeError) and self._stop_at_pipe:
-            return 128 + signal.SIGPIPE
+            return PIPE_CLOSED
         print(
             f"adaafford: the standard output could not be written ({lost.strerror}), so some of it is lost; "
             "all else was done",

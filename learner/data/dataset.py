@@ -26,6 +26,7 @@ from shared.networks.actions import middle_of
 from shared.networks.grouping import group_cloud
 from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import CloudBatch
+from shared.store.clouds import observations_at
 from shared.store.codecs.columns import LIST, Column, hidden_names, interaction_columns
 from shared.store.codecs.tables import column_values
 from shared.store.layout import MAX_ROWS
@@ -249,22 +250,17 @@ def _coded(table: Any, name: str) -> tuple[list[str], NDArray[np.int64]]:
 
 
 def _read_clouds(
-    store: Store, names: Iterable[tuple[str, int]], count: int
+    store: Store, places: Iterable[tuple[str, int]], count: int
 ) -> tuple[Float32, NDArray[np.bool_], NDArray[np.float64]]:
     """Clouds by shard and index: points in the view frame, movable masks, and the turn from world to view [O, 3, 3]."""
     size = store.setting.collection.camera.points
     # Filled one by one, since a list of so many arrays would be in memory beside what they are stacked into.
     points = np.empty((count, size, 3), np.float32)
     movable, views = np.empty((count, size), np.bool_), np.empty((count, 3, 3))
-    shard, arrays = "", None
-    for number, (name, index) in enumerate(names):
-        if arrays is None or name != shard:
-            shard, arrays = name, store.read_observations(name)
-        if not 0 <= index < len(arrays) or arrays.points.shape[1] != size:
-            raise StoreError(f"{store.where}: shard {name} has no observation {index}; it is damaged")
-        views[number] = view_from_world(arrays.world_from_camera[index])
-        points[number] = arrays.points[index] @ views[number].T.astype(np.float32)
-        movable[number] = arrays.movable[index]
+    for number, seen in enumerate(observations_at(store, places)):
+        views[number] = view_from_world(seen.world_from_camera)
+        points[number] = seen.points @ views[number].T.astype(np.float32)
+        movable[number] = seen.movable
     return points, movable, views
 
 

@@ -3,32 +3,30 @@
 store = Store.create(path, setting)                       # or opens it, if it holds the same setting
 store.commit(plan, job, rollouts, {"physics_s": "6.1"})   # a worker, or many at once
 table = store.interactions(["point", "success"])          # a learner
-clouds = store.read_observations(shard_id)
+clouds = store.clouds(table)
 """
 
-import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from shared.errors import StoreError, UnreadableError, UsageError
-from shared.hidden import hidden_parameter
 from shared.io.files import TEMPORARY_PREFIX
 from shared.plan import Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import policies, reader
 from shared.store.backends.base import Folder, StorageBackend, backend_of, is_url
 from shared.store.backends.conformance import check_place
+from shared.store.clouds import observations_of, stacked
 from shared.store.codecs.checksummed import with_checksum
-from shared.store.codecs.columns import added_in, interaction_columns, rollout_columns
+from shared.store.codecs.columns import interaction_columns, rollout_columns
 from shared.store.codecs.digest import combined_digest
 from shared.store.codecs.observations import ObservationArrays
-from shared.store.codecs.tables import schema_of
 from shared.store.coverage import Part, parts_of
 from shared.store.crash_log import CRASH_LOG_FOLDER, CrashLog
 from shared.store.layout import (
@@ -50,8 +48,10 @@ from shared.store.layout import (
 from shared.store.maintenance.difference import difference_of
 from shared.store.presence import DRIVER
 from shared.store.provenance import store_software
+from shared.store.selection import Condition, Selection
 from shared.store.snapshot import Snapshot
 from shared.store.writer import commit_shard
+from shared.types import Observation
 
 MAX_SEED = 2**64 - 1
 _TABLES_AT_ONCE = 256
@@ -300,41 +300,60 @@ class Store:
             for index in range(part.start, part.stop)
         )
 
-    def interactions(self, columns: Sequence[str] | None = None, plan_keys: Sequence[str] | None = None) -> Any:
+    def interactions(
+        self,
+        columns: Sequence[str] | None = None,
+        plan_keys: Sequence[str] | None = None,
+        where: Sequence[Condition] = (),
+    ) -> Any:
         """A pyarrow table, one row an interaction; "shard" and "observation" (index in it) find a row's cloud.
 
         Args:
             columns: names (see `shared.store.codecs.columns`); None: all. "shard" and "observation" always come. A
                 hidden parameter that the store lacks has its default in every row, if its package is installed.
             plan_keys: rows of these plans only; None: all.
+            where: rows that meet all of these conditions only, such as ("outcome", "=", "ok"). Rows of one shard at a
+                time are in memory beside the result.
 
         Raises:
-            UsageError: there is no such column.
+            UsageError: there is no such column, or a condition is none.
             StoreError: a file is damaged or foreign.
         """
-        known = schema_of(interaction_columns(self.setting.dynamics.added))
-        names = list(known.names if columns is None else dict.fromkeys([*columns, "observation"]))
-        lacking = {name: default for name in names if name not in known.names for default in _defaults(name)}
-        names = [name for name in names if name != "shard" and name not in lacking]
-        for name in names:
-            if name not in known.names:
-                close = difflib.get_close_matches(name, known.names, n=1)
-                hint = f"did you mean '{close[0]}'?" if close else f"allowed: {', '.join(known.names)}"
-                raise UsageError(f"no column '{name}' in the interactions; {hint}")
-        schema = pa.schema([known.field(name) for name in names])
-        table = _one_table(schema, self.each(INTERACTIONS_FILE, names, plan_keys))
-        for name, default in lacking.items():
-            table = table.append_column(name, pa.array(np.full(len(table), default)))
-        return table
+        return self._table(INTERACTIONS_FILE, self.select(columns, where), plan_keys)
 
-    def rollouts(self) -> Any:
-        """A pyarrow table, one row a rollout, those without interactions included; "shard" says where it lies.
+    def rollouts(self, columns: Sequence[str] | None = None, where: Sequence[Condition] = ()) -> Any:
+        """A pyarrow table, one row a rollout, those without interactions included; "shard" says where it is stored.
+
+        Args:
+            columns: names; None: all. "shard" always comes.
+            where: as for `interactions`.
 
         Raises:
+            UsageError: there is no such column, or a condition is none.
             StoreError: a file is damaged or foreign.
         """
-        schema = schema_of(rollout_columns(self.setting.dynamics.added))
-        return _one_table(schema, self.each(ROLLOUTS_FILE, schema.names))
+        known = rollout_columns(self.setting.dynamics.added)
+        return self._table(ROLLOUTS_FILE, Selection.of("rollouts", known, _stored(columns), where))
+
+    def select(self, columns: Sequence[str] | None = None, where: Sequence[Condition] = ()) -> Selection:
+        """Columns and rows of the interactions, checked; raises and takes arguments as `interactions`."""
+        known = interaction_columns(self.setting.dynamics.added)
+        names = _stored(columns)
+        if names is not None:
+            names.append("observation")
+        return Selection.of("interactions", known, names, where)
+
+    def _table(self, file: str, selection: Selection, plan_keys: Sequence[str] | None = None) -> Any:
+        """What is selected from one of the two tables of all shards, and which shard each row is of."""
+        tables = [_with_shard(selection.schema.empty_table(), "")]
+        few: list[Any] = []
+        for part, _, table in self.each(file, selection.read, plan_keys):
+            few.append(_with_shard(selection.of_table(table), part.shard.shard_id))
+            if len(few) == _TABLES_AT_ONCE:
+                # Copied together: a column of one shard takes far more memory than its numbers.
+                tables.append(pa.concat_tables(few).combine_chunks())
+                few.clear()
+        return pa.concat_tables([*tables, *few])
 
     def each(
         self, file: str, names: Sequence[str] | None = None, plan_keys: Sequence[str] | None = None
@@ -351,6 +370,37 @@ class Store:
         """
         shard = self._committed_shard(shard_id)
         return reader.read_observations(shard, reader.read_manifest(shard))
+
+    def observations(self, rows: Any) -> Iterator[Observation]:
+        """The cloud of each row of a table of interactions, in order.
+
+        A shard is read once for all rows of it that follow each other, as they do in `interactions()`.
+
+        Args:
+            rows: any table with the columns "shard" and "observation".
+
+        Raises:
+            UsageError: the table lacks these columns.
+            StoreError: a shard is missing, damaged or foreign, or has no such observation.
+        """
+        return observations_of(self, rows)
+
+    def clouds(self, rows: Any) -> ObservationArrays:
+        """The clouds of all rows of a table of interactions as arrays, [rows, ...]; as `observations` otherwise."""
+        return stacked(self.observations(rows), len(rows), self.setting.collection.camera.points)
+
+    def cloud_batches(self, rows: Any, size: int) -> Iterator[tuple[Any, ObservationArrays]]:
+        """At most `size` rows at a time and their clouds, in order; as `observations` otherwise.
+
+        Raises:
+            UsageError: the size is below 1.
+        """
+        if size < 1:
+            raise UsageError(f"batches of {size} rows are not possible; give 1 or more")
+        found = self.observations(rows)
+        for start in range(0, len(rows), size):
+            some = rows.slice(start, size)
+            yield some, stacked(islice(found, len(some)), len(some), self.setting.collection.camera.points)
 
     def read_rollouts(self, shard_id: str) -> tuple[RolloutRecord, ...]:
         """The records of a shard, bit for bit as they were committed.
@@ -403,12 +453,6 @@ class Store:
         return folder
 
 
-def _defaults(column: str) -> list[float]:
-    """What the hidden parameter of a column was where a store lacks it; empty where nothing says so."""
-    found = [hidden_parameter(name) for name in added_in([column])]
-    return [each.default for each in found if each is not None and each.default is not None]
-
-
 def _refuse_foreign(backend: StorageBackend) -> None:
     """Refuse a folder that holds anything but what another process, creating at this moment, may have put there."""
     for name in backend.names(""):
@@ -417,17 +461,9 @@ def _refuse_foreign(backend: StorageBackend) -> None:
             raise StoreError(f"{backend.where}: is not empty and no store (it holds {name!r}); name an empty folder")
 
 
-def _one_table(schema: Any, found: Iterable[tuple[Part, ShardManifest, Any]]) -> Any:
-    """The tables of many shards as one, and which shard each row is of."""
-    tables = [_with_shard(schema.empty_table(), "")]
-    few: list[Any] = []
-    for part, _, table in found:
-        few.append(_with_shard(table, part.shard.shard_id))
-        if len(few) == _TABLES_AT_ONCE:
-            # Copied together: a column of one shard takes far more memory than its numbers.
-            tables.append(pa.concat_tables(few).combine_chunks())
-            few.clear()
-    return pa.concat_tables([*tables, *few])
+def _stored(columns: Sequence[str] | None) -> list[str] | None:
+    """Columns of the files among some names; "shard" is none of them, and comes in any case."""
+    return None if columns is None else [name for name in columns if name != "shard"]
 
 
 def _with_shard(table: Any, shard_id: str) -> Any:

@@ -125,21 +125,46 @@ def test_a_poor_terminal_is_enough(folder: Path, environment: dict[str, str]) ->
         assert done.stdout, name
 
 
-def test_a_reader_that_has_enough_ends_the_command_without_a_word(folder: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+def without_reader(folder: Path, args: Sequence[str], unbuffered: bool) -> "subprocess.CompletedProcess[bytes]":
+    """A command line whose output goes into a pipe that nobody reads."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "PYTHONUNBUFFERED": "1" * unbuffered}
     reading, writing = os.pipe()
     os.close(reading)
     try:
-        done = subprocess.run(
-            [*ADAAFFORD, "objects", "check", "OBJECTS"],
-            cwd=folder,
-            env=environment,
-            stdout=writing,
-            stderr=subprocess.PIPE,
-        )
+        command = [*ADAAFFORD, *args]
+        return subprocess.run(command, cwd=folder, env=environment, stdout=writing, stderr=subprocess.PIPE)
     finally:
         os.close(writing)
+
+
+@pytest.mark.parametrize("unbuffered", [False, True])
+@pytest.mark.parametrize("args", [["--help"], ["objects", "check", "OBJECTS"]], ids=lambda args: args[0])
+def test_a_reader_that_has_enough_ends_the_command_without_a_word(
+    folder: Path, args: list[str], unbuffered: bool
+) -> None:
+    done = without_reader(folder, args, unbuffered)
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+
+
+@pytest.mark.slow
+def test_a_reader_that_has_enough_ends_every_command_that_only_prints_without_a_word(folder: Path) -> None:
+    more = {
+        "store info as JSON": ["store", "info", "STORE", "--json"],
+        "store compact": ["store", "compact", "STORE"],
+        "store help": ["store", "--help"],
+    }
+    lines = [args for args in (SPEAKING | more).values() if "--out" not in args]
+    with ThreadPoolExecutor(2) as pool:
+        done = pool.map(lambda args: without_reader(folder, args, unbuffered=True), lines)
+        for args, each in zip(lines, done, strict=True):
+            assert (each.returncode, each.stderr) == (128 + signal.SIGPIPE, b""), args
+
+
+def test_what_goes_into_out_is_written_although_nobody_reads_the_output(folder: Path) -> None:
+    done = without_reader(folder, ["store", "merge", "STORE", "--out", "MERGED"], unbuffered=True)
+    assert done.returncode == 1
+    assert done.stderr.decode().splitlines()[-1].startswith("adaafford: the standard output could not be written (")
+    assert Store.open(folder / "MERGED").digest() == Store.open(folder / "STORE").digest()
 
 
 def test_a_closed_stream_takes_no_file_of_ours(folder: Path) -> None:

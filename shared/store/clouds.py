@@ -1,0 +1,48 @@
+"""The clouds that rows of a table of interactions were decided on; each shard is read once for the rows that follow."""
+
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from shared.errors import StoreError, UsageError
+from shared.store.codecs.observations import ARRAYS, ObservationArrays
+from shared.types import Observation
+
+if TYPE_CHECKING:
+    from shared.store.store import Store
+
+
+def observations_of(store: "Store", rows: Any) -> Iterator[Observation]:
+    """See `Store.observations`."""
+    for name in ("shard", "observation"):
+        if name not in rows.schema.names:
+            raise UsageError(f"a table without the column '{name}' has no clouds; take it from `Store.interactions`")
+    shards = (shard.as_py() for shard in rows.column("shard"))
+    return observations_at(store, zip(shards, rows.column("observation").to_pylist(), strict=True))
+
+
+def observations_at(store: "Store", places: Iterable[tuple[str, int]]) -> Iterator[Observation]:
+    """The clouds at some places, each a shard and the cloud's number in it.
+
+    Raises:
+        StoreError: a shard is missing, damaged or foreign, or has no such cloud.
+    """
+    points = store.setting.collection.camera.points
+    shard, arrays = "", None
+    for name, index in places:
+        if arrays is None or name != shard:
+            shard, arrays = name, store.read_observations(name)
+        if not 0 <= index < len(arrays) or arrays.points.shape[1] != points:
+            raise StoreError(f"{store.where}: shard {name} has no observation {index}; it is damaged")
+        yield arrays.observation(index)
+
+
+def stacked(found: Iterable[Observation], count: int, points: int) -> ObservationArrays:
+    """`count` clouds of `points` as arrays."""
+    # Filled one by one, since a list of so many arrays would be in memory beside what they are stacked into.
+    arrays = {kind.name: np.empty((count, *kind.shape(points)), kind.seen) for kind in ARRAYS}
+    for number, observation in enumerate(found):
+        for name, array in arrays.items():
+            array[number] = getattr(observation, name)
+    return ObservationArrays(**arrays)
