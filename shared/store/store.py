@@ -270,8 +270,14 @@ class Store:
                 raise StoreError(
                     f"{job.shard_id}: rollout {rollout.index} has other hidden parameters than the store's"
                 )
-        points = self.setting.collection.camera.points
-        return commit_shard(self.backend, job, rollouts, points, provenance, quarantined, vetted=vetted)
+        camera = self.setting.collection.camera
+        kept = camera.keep_depth
+        if any((seen.dense is not None) != kept for rollout in rollouts for seen in rollout.observations):
+            raise StoreError(
+                f"{job.shard_id}: a simulator must keep the depth image of each observation if, and only if, "
+                f"collection.camera.keep_depth is set; here it is {str(kept).lower()}"
+            )
+        return commit_shard(self.backend, job, rollouts, camera.points, provenance, quarantined, vetted=vetted)
 
     def only_driver(self, *, alone: bool = False) -> AbstractContextManager[Any]:
         """Hold the store against other drivers, which would do everything twice.
