@@ -13,6 +13,7 @@ from shared.errors import StoreError
 from shared.plan import Job, Plan, Setting
 from shared.records import RolloutRecord
 from shared.store import Store, compact, export, merge, repair, verify
+from shared.store.codecs import observations
 from shared.store.codecs.checksummed import with_checksum, without_checksum
 from shared.store.codecs.digest import rollout_digest
 from shared.store.layout import DEPTH_VERSION, SCHEMA_VERSION, StoreDocument
@@ -91,7 +92,10 @@ def test_stores_with_depth_images_are_repaired_compacted_merged_and_exported(tmp
     assert merge([store], tmp_path / "merged")[0].digest() == digest
     export(store, tmp_path / "export", {"all": frozenset(each.id for each in SETTING.objects)})
     exported = zarr.open_group(tmp_path / "export" / "all" / "observations.zarr", mode="r")
-    assert exported["depth"].shape == (3, 32, 32)
+    packed = np.asarray(exported["depth"][:1]).astype(np.int64)
+    steps = np.where(packed % 2, -(packed + 1) // 2, packed // 2).cumsum(axis=-1).cumsum(axis=-2) % (1 << 16)
+    assert np.array_equal(steps[0], depth_of(fabricate_rollout(PLAN, 0)).steps)
+    assert "32,768 is the depth" in (tmp_path / "export" / "README.md").read_text()
     compact(store, 64)
     assert (len(store.committed()), store.digest()) == (1, digest)
     assert verify(store) == []
@@ -129,6 +133,26 @@ def test_depth_images_of_several_sizes_are_refused(tmp_path: Path) -> None:
         Store.create(tmp_path / "store", SETTING).commit(
             PLAN, job, [one, dataclasses.replace(other, observations=(larger,))], {}
         )
+
+
+@pytest.mark.parametrize("focal", [0.0, -3.0, float("nan"), float("inf")])
+def test_what_is_no_focal_length_is_refused(focal: float) -> None:
+    seen = fabricate_rollout(PLAN, 0, interactions=1).observations[0]
+    assert isinstance(seen.dense, DepthMap)
+    odd = dataclasses.replace(seen, dense=dataclasses.replace(seen.dense, focal=np.array([focal])))
+    with pytest.raises(ValueError, match="focal"):
+        observations.check_observation(odd, 64)
+    files = observations.encode([observations.pack(odd)], 64, 32)
+    with pytest.raises(StoreError, match="no focal lengths"):
+        observations.decode(files, 1, 64, 32, "it")
+
+
+def test_depth_maps_of_another_camera_are_refused() -> None:
+    seen = fabricate_rollout(PLAN, 0, interactions=1).observations[0]
+    assert isinstance(seen.dense, DepthMap)
+    odd = dataclasses.replace(seen, dense=dataclasses.replace(seen.dense, world_from_camera=np.eye(4)))
+    with pytest.raises(ValueError, match="another camera"):
+        observations.check_observation(odd, 64)
 
 
 def test_a_manifest_cannot_ask_for_too_many_pixels(tmp_path: Path) -> None:

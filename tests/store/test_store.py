@@ -145,7 +145,7 @@ def mutations(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         yield name, not value
     elif isinstance(value, float) and np.isnan(value):
         yield name, 0.0
-    else:
+    elif value is not None:
         yield name, value + 1
 
 
