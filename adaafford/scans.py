@@ -29,7 +29,7 @@ from shared.errors import UsageError
 from shared.geometry import camera_pose, gripper_rotation
 from shared.io.files import read_bounded
 from shared.observation import furthest_first, round_normals, round_points
-from shared.types import Action, Float, Observation
+from shared.types import Action, Float, Float32, Observation
 
 MIN_POINTS, MAX_POINTS = 64, 1920 * 1080
 MAX_ROWS = 1 << 23
@@ -45,6 +45,8 @@ _NORMAL_NEIGHBOURS = 16
 _MIN_NORMAL = 1e-9
 _MISSING_SHARE = 0.1
 """What a depth camera misses without anybody being told."""
+_DENSE_NEIGHBOUR, _DENSE_M, _DENSE_SAMPLE = 4, 0.02, 256
+"""A scan is dense if half of some points have so many others within so many metres."""
 _STEEP_DEG = 80.0
 """Training saw objects from 30 to 60 deg above."""
 _OFF_LEVEL_DEG = 30.0
@@ -302,7 +304,38 @@ def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = PO
         movable=movable,
         pixels=(kept if scan.rows is None else scan.rows[kept]).astype(np.uint32),
         world_from_camera=world_from_camera,
+        dense=ScannedSurface(scan, frame),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class ScannedSurface:
+    """A scan before it was thinned; implements `shared.types.DenseGeometry`.
+
+    Attributes:
+        scan: as it was taken.
+        frame: how it lies in the world.
+    """
+
+    scan: Scan
+    frame: ScanFrame
+
+    def points(self) -> Float32:
+        """All points of the scan, [M, 3], world frame, rounded as clouds are.
+
+        Raises:
+            UsageError: they are too far apart to show what lies between fingers.
+        """
+        points = self.scan.points
+        asked = points[np.linspace(0, len(points) - 1, min(_DENSE_SAMPLE, len(points))).astype(int)]
+        # The nearest point to each is itself.
+        apart = float(np.median(cKDTree(points).query(asked, k=[_DENSE_NEIGHBOUR + 1])[0]))
+        if not apart <= _DENSE_M:
+            raise UsageError(
+                f"the policy is told what lies between the fingers, and the points are {apart:.3f} m apart; "
+                "give the scan before it is thinned, with a point every centimetre or closer"
+            )
+        return round_points(self.frame.to_world(points))
 
 
 def action_at(observation: Observation, frame: ScanFrame, point: Vector, approach: Vector, forward: Vector) -> Action:

@@ -54,14 +54,20 @@ class Worker:
         self._adapters: dict[int, Adapter] = {}
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
-        """Take up the weights of a policy version."""
+        """Take up the weights of a policy version.
+
+        Raises:
+            UsageError: the policy is told depth images, and the store keeps none.
+        """
         # Networks are imported with the first policy: PyTorch is half of a worker's start, and random rounds need none.
         from shared.policies.adaptation import Adapter
         from shared.policies.policy import Policy
 
+        policy = Policy.from_files(files)
+        policy.check_camera(self._store.setting.collection.camera)
         while len(self._adapters) >= CACHED_POLICIES:
             self._adapters.pop(next(iter(self._adapters)))
-        self._adapters[version] = Adapter(Policy.from_files(files))
+        self._adapters[version] = Adapter(policy)
 
     def run(
         self,

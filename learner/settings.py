@@ -42,6 +42,8 @@ class AugmentationConfig(StrictModel):
     """Reflect half of the sets of interactions."""
     turn_deg: float = Field(15.0, ge=0, le=180)
     """Turn each set about the vertical by up to this much."""
+    flip: bool = Field(False, exclude_if=lambda flips: not flips)
+    """Turn the gripper by 180 deg about its approach in half of the sets, which swaps its fingers."""
 
 
 class AffordanceConfig(TrainingConfig):

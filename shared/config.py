@@ -16,6 +16,8 @@ from shared.io.text import MAX_WORD, plain
 from shared.types import Order
 
 MAX_CONFIGURATION_BYTES = 1 << 18
+MAX_DEPTH_SIZE = 1024
+"""Width and height, pixels, of a depth image that is kept."""
 MAX_DOTS = 100
 """In a line of a configuration file, paths included."""
 
@@ -88,11 +90,15 @@ class CameraConfig(StrictModel):
     """Hit pixels drawn at random before furthest-point sampling, as published."""
     renderer: Literal["embree", "sapien"] = "embree"
     """Who renders: Embree on the CPU, or SAPIEN's own renderer, which needs a Vulkan device."""
+    keep_depth: bool = Field(False, exclude_if=lambda kept: not kept)
+    """Keep the whole depth image of each observation beside its cloud, some KB, which `network.pinch_profile` needs."""
 
     @model_validator(mode="after")
     def _enough_candidates(self) -> "CameraConfig":
         if self.candidates < self.points:
             raise ValueError(f"candidates ({self.candidates}) must be at least points ({self.points})")
+        if self.keep_depth and self.image_size > MAX_DEPTH_SIZE:
+            raise ValueError(f"keep_depth needs an image_size of at most {MAX_DEPTH_SIZE}; given {self.image_size}")
         return self
 
 

@@ -129,6 +129,14 @@ class HiddenDynamics:
         return tuple(sorted(self.values.keys() - ALWAYS_DRAWN.keys()))
 
 
+class DenseGeometry(Protocol):
+    """What is known of an object's surface beyond the points of its cloud."""
+
+    def points(self) -> Float32:
+        """The surface at the full resolution of its sensor, [M, 3], world frame."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Observation:
     """A partial cloud of one object from one camera, in furthest-point order: any prefix covers the object.
@@ -148,6 +156,8 @@ class Observation:
     """[N], row * image width + column of the ray that hit the point."""
     world_from_camera: Float
     """[4, 4], rigid."""
+    dense: DenseGeometry | None = None
+    """The whole of what the sensor measured, where it was kept: `collection.camera.keep_depth`, or a robot's scan."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -144,7 +144,7 @@ class Campaign:
         catalogue, folder = objects_for(task, config, built_in, per_category, config.seed, lists)
         parts = split_as_told((entry.ref for entry in catalogue.usable), config.splits, config.seed)
         if config.start_from is not None:
-            fit_to_start_from(config.start_from, config.task)
+            fit_to_start_from(config.start_from, config.task).check_camera(config.collection.camera)
             seen = seen_by(config.start_from)
             if not seen:
                 self._console.print(f"start_from {unknown(config.start_from)}")

@@ -86,6 +86,7 @@ class Evaluation:
         for version in versions_of(self.config.methods, self.version):
             files = self.policies(version)
             policy = Policy.from_files(files)
+            policy.check_camera(self.store.setting.collection.camera)
             for name in self.config.methods:
                 if METHODS.get(name).policy_version(self.version) == version:
                     policy.require(*METHODS.get(name).modules)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from collector.objects.articulation import ArticulatedObject, Body
 from shared.config import CameraConfig
+from shared.depth import DepthMap
 from shared.observation import furthest_first, round_normals, round_points
 from shared.types import Float, Observation
 
@@ -64,7 +65,7 @@ class EmbreeCamera:
         self.world_from_camera = world_from_camera
         self._object = target
         self._size = config.image_size
-        self._focal = config.image_size / 2 / np.tan(np.deg2rad(config.field_of_view_deg) / 2)
+        self._focal = focal_length(config)
         if target not in _SCENES:
             _SCENES[target] = tuple(_BodyScene(body) for body in target.bodies)
         self._bodies = _SCENES[target]
@@ -185,6 +186,9 @@ def observation_from(
     # A small object fills few pixels: then every one is kept, and some stand twice.
     kept = furthest_first(image.points, config.points, config.candidates, rng)
     bodies = image.bodies[kept]
+    dense = None
+    if config.keep_depth:
+        dense = DepthMap.of(image.pixels, image.depths, config.image_size, focal_length(config), world_from_camera)
     return Observation(
         points=round_points(image.points[kept]),
         normals=round_normals(image.normals[kept]),
@@ -192,4 +196,10 @@ def observation_from(
         movable=np.isin(bodies, np.array(qualifying, dtype=np.uint8)),
         pixels=image.pixels[kept],
         world_from_camera=world_from_camera,
+        dense=dense,
     )
+
+
+def focal_length(config: CameraConfig) -> float:
+    """Of a camera's images, pixels."""
+    return float(config.image_size / 2 / np.tan(np.deg2rad(config.field_of_view_deg) / 2))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from learner.data.privileged import WAY_WIDTH, WAYS_WIDTH, ordered_ways
 from learner.settings import AugmentationConfig
+from shared.networks.actions import FRAME_WIDTH, swapped_fingers, turned_over
 
 
 def draw_turns(count: int, config: AugmentationConfig, rng: np.random.Generator) -> Tensor:
@@ -24,6 +25,23 @@ def draw_turns(count: int, config: AugmentationConfig, rng: np.random.Generator)
     turns[:, 1, 0], turns[:, 1, 1] = sin, cos * sign
     turns[:, 2, 2] = 1.0
     return torch.as_tensor(turns)
+
+
+def draw_flips(count: int, config: AugmentationConfig, rng: np.random.Generator) -> Tensor:
+    """Whether the gripper is turned about its approach in each set, [count]."""
+    return torch.as_tensor(rng.random(count) < 0.5 if config.flip else np.zeros(count, dtype=bool))
+
+
+def turn_frames(turns: Tensor, frames: Tensor) -> Tensor:
+    """Frames with or without pinch profiles, [B, n, 6 or more], after the turns [B, 3, 3]."""
+    turned = torch.cat([turn_vectors(turns, frames[..., :FRAME_WIDTH]), frames[..., FRAME_WIDTH:]], dim=-1)
+    # A mirror keeps approach and forward, and so swaps the fingers.
+    return torch.where((torch.linalg.det(turns) < 0)[:, None, None], swapped_fingers(turned), turned)
+
+
+def flip_frames(flips: Tensor, frames: Tensor) -> Tensor:
+    """Frames with or without pinch profiles, [B, n, 6 or more], turned about the approach in the sets `flips`, [B]."""
+    return torch.where(flips[:, None, None], turned_over(frames), frames)
 
 
 def turn_vectors(turns: Tensor, vectors: Tensor) -> Tensor:

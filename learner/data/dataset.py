@@ -26,12 +26,13 @@ from shared.networks.actions import middle_of
 from shared.networks.grouping import group_cloud
 from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import CloudBatch
+from shared.pinch import PROFILE_WIDTH, REACH_M, pinch_profiles
 from shared.store.clouds import observations_at
 from shared.store.codecs.columns import LIST, Column, hidden_names, interaction_columns
 from shared.store.codecs.tables import column_values
 from shared.store.layout import MAX_ROWS
 from shared.store.store import Store
-from shared.types import Float, Float32, Order, OutcomeKind
+from shared.types import Float, Float32, Observation, Order, OutcomeKind
 
 COLUMNS = (
     *("plan_key", "rollout", "object_id", "step"),
@@ -51,7 +52,7 @@ class Rows:
         cloud: [I], index of the cloud.
         point: [I], index of p in it.
         xyz: p less the middle of what may be moved, [I, 3].
-        frame: approach and forward, [I, 6].
+        frame: approach and forward, and the pinch profile where networks are told it, [I, 6 or more].
         motion: m, [I].
         success: r as 0 or 1, [I].
         step: [I], number within the rollout.
@@ -81,6 +82,34 @@ class Rows:
 
 
 @dataclass(frozen=True, slots=True)
+class DenseClouds:
+    """The surfaces that pinch profiles are computed from, as far as a hand reaches that acts on what may be moved.
+
+    Attributes:
+        points: of each cloud [M, 3], world frame.
+        views: [O, 3, 3], the turns from the world to the view frame.
+    """
+
+    points: tuple[NDArray[np.float16], ...]
+    views: Float
+
+    def frames(self, cloud: Tensor, places: Tensor, frames: Tensor) -> Tensor:
+        """Actions with their pinch profiles, [Q, S, 6 or more].
+
+        Args:
+            cloud: [Q].
+            places: p, [Q, 3], view frame.
+            frames: approach and forward of S actions at each, [Q, S, 6].
+        """
+        at, given = places.numpy(force=True), frames.numpy(force=True)
+        profiles = np.empty((*given.shape[:2], PROFILE_WIDTH), np.float32)
+        for number, which in enumerate(cloud.tolist()):
+            dense = self.points[which].astype(np.float32) @ self.views[which].T.astype(np.float32)
+            profiles[number] = pinch_profiles(dense, at[number], given[number])
+        return torch.cat([frames, torch.as_tensor(profiles, device=frames.device)], dim=-1)
+
+
+@dataclass(frozen=True, slots=True)
 class Dataset:
     """A store's interactions.
 
@@ -94,6 +123,7 @@ class Dataset:
         rollouts: for each rollout, its rows in order of step.
         objects: for each rollout, its object's id.
         versions: for each rollout, the version of the policy that proposed in it; 0 is none.
+        dense: of the clouds, where networks are told pinch profiles.
     """
 
     task: str
@@ -105,6 +135,7 @@ class Dataset:
     rollouts: tuple[Tensor, ...]
     objects: tuple[str, ...]
     versions: tuple[int, ...]
+    dense: DenseClouds | None = None
 
     def on(self, device: torch.device) -> "Dataset":
         """The same on a device; the numbers of the rollouts' rows stay, since batches are drawn on the CPU."""
@@ -128,7 +159,13 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
 
     Raises:
         StoreError: the store is damaged, or holds no label at all.
+        UsageError: the networks are told pinch profiles, and the store keeps no depth images.
     """
+    if config.pinch_profile and not store.setting.collection.camera.keep_depth:
+        raise UsageError(
+            f"{store.where}: keeps no depth images, which network.pinch_profile needs; collect with "
+            "--collection.camera.keep-depth, or unset it"
+        )
     ranges = store.setting.dynamics
     known = {column.name: column for column in interaction_columns(ranges.added)}
     hidden = hidden_names(ranges.added)
@@ -142,12 +179,15 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
     shards, shard = _coded(table, "shard")
     seen, cloud = np.unique(shard * MAX_ROWS + cells["observation"], return_inverse=True)
     places = ((shards[number // MAX_ROWS], int(number % MAX_ROWS)) for number in seen)
-    points, movable, views = _read_clouds(store, places, len(seen))
+    points, movable, views, dense = _read_clouds(store, places, len(seen), config.pinch_profile)
     batch = CloudBatch.of(points, (group_cloud(each, config) for each in points))
     masks = torch.from_numpy(movable)
     middles = middle_of(batch.points, masks)
     dynamics = {name: cells[column] for name, column in hidden.items()}
     rows = _rows(cells, dynamics, ranges, cloud, batch.points, views, middles)
+    if dense is not None:
+        at = batch.points[rows.cloud, rows.point]
+        rows = replace(rows, frame=dense.frames(rows.cloud, at, rows.frame[:, None])[:, 0])
     order, starts = _by_rollout(table, cells)
     objects, of_object = _coded(table, "object_id")
     return Dataset(
@@ -160,6 +200,7 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
         rollouts=torch.from_numpy(order).tensor_split(torch.from_numpy(starts[1:])),
         objects=tuple(objects[number] for number in of_object[order[starts]]),
         versions=tuple(np.maximum.reduceat(cells["policy_version"][order], starts).tolist()),
+        dense=dense,
     )
 
 
@@ -250,18 +291,40 @@ def _coded(table: Any, name: str) -> tuple[list[str], NDArray[np.int64]]:
 
 
 def _read_clouds(
-    store: Store, places: Iterable[tuple[str, int]], count: int
-) -> tuple[Float32, NDArray[np.bool_], NDArray[np.float64]]:
-    """Clouds by shard and index: points in the view frame, movable masks, and the turn from world to view [O, 3, 3]."""
+    store: Store, places: Iterable[tuple[str, int]], count: int, keep_dense: bool
+) -> tuple[Float32, NDArray[np.bool_], Float, DenseClouds | None]:
+    """Clouds by shard and index: points in the view frame, movable masks, and the turn from world to view [O, 3, 3].
+
+    With `keep_dense`, their dense points as well.
+    """
     size = store.setting.collection.camera.points
     # Filled one by one, since a list of so many arrays would be in memory beside what they are stacked into.
     points = np.empty((count, size, 3), np.float32)
     movable, views = np.empty((count, size), np.bool_), np.empty((count, 3, 3))
+    dense = []
     for number, seen in enumerate(observations_at(store, places)):
         views[number] = view_from_world(seen.world_from_camera)
         points[number] = seen.points @ views[number].T.astype(np.float32)
         movable[number] = seen.movable
-    return points, movable, views
+        if keep_dense:
+            dense.append(_within_reach(seen))
+    return points, movable, views, DenseClouds(tuple(dense), views) if keep_dense else None
+
+
+def _within_reach(observation: Observation) -> NDArray[np.float16]:
+    """The dense points that a hand can reach which acts on a movable point, [M, 3], world frame.
+
+    Raises:
+        StoreError: the observation keeps no depth image.
+    """
+    if observation.dense is None:
+        raise StoreError("an observation of the store keeps no depth image; run `adaafford store verify`")
+    points = observation.dense.points()
+    touched = observation.points[observation.movable] if observation.movable.any() else observation.points
+    low, high = touched.min(axis=0) - REACH_M, touched.max(axis=0) + REACH_M
+    # Dense points are rounded to float16, so that this loses nothing.
+    within: NDArray[np.float16] = points[((points >= low) & (points <= high)).all(axis=1)].astype(np.float16)
+    return within
 
 
 def _rows(

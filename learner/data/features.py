@@ -80,22 +80,27 @@ class ProposalPool:
         point: [O, P], index in the cloud.
         features: [O, P, point_width], of the prior.
         prior: whose proposal network draws.
+        dataset: of the clouds.
     """
 
     point: Tensor
     features: Tensor
     prior: Prior
+    dataset: Dataset
 
     @classmethod
     def of(cls, prior: Prior, features: FrozenFeatures) -> "ProposalPool":
         """The pool's points under a prior."""
-        return cls(features.point, features.pool(prior.encoder), prior)
+        return cls(features.point, features.pool(prior.encoder), prior, features.dataset)
 
     @torch.no_grad()
     def draw(self, cloud: Tensor, slot: Tensor, count: int, rng: np.random.Generator) -> Tensor:
-        """`count` rotations at points of the pool, given by cloud and slot, [Q] each; [Q, count, 6]."""
+        """`count` actions at points of the pool, given by cloud and slot, [Q] each; [Q, count, 6 or more]."""
         noise = rng.standard_normal((len(cloud), count, self.prior.config.noise_width)).astype(np.float32)
-        return self.prior.propose(self.features[cloud, slot][:, None], torch.as_tensor(noise))
+        frames = self.prior.propose(self.features[cloud, slot][:, None], torch.as_tensor(noise))
+        if self.dataset.dense is None:
+            return frames
+        return self.dataset.dense.frames(cloud, self.dataset.clouds.points[cloud, self.point[cloud, slot]], frames)
 
 
 @torch.no_grad()

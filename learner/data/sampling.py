@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.data.augmentation import turn_facts, turn_vectors
+from learner.data.augmentation import flip_frames, turn_facts, turn_frames, turn_vectors
 from learner.data.dataset import Dataset
 from shared.networks.pointnet2 import CloudBatch, PointNet2
 
@@ -104,7 +104,7 @@ class Batch:
         cloud: [B, n], index of each row's cloud among them.
         point: [B, n], index of p in it.
         xyz: p less the middle of what may be moved, [B, n, 3].
-        frame: approach and forward, [B, n, 6].
+        frame: approach and forward, and the pinch profile where networks are told it, [B, n, 6 or more].
         motion: m, [B, n].
         success: r as 0 or 1, [B, n].
         facts: [B, n, facts].
@@ -120,8 +120,17 @@ class Batch:
     facts: Tensor
 
     @classmethod
-    def of(cls, dataset: Dataset, ordered: OrderedRows, turns: Tensor | None = None) -> "Batch":
-        """Collect the rows; `turns`, [B, 3, 3], are what each set is seen after, which must share no cloud."""
+    def of(
+        cls, dataset: Dataset, ordered: OrderedRows, turns: Tensor | None = None, flips: Tensor | None = None
+    ) -> "Batch":
+        """Collect the rows.
+
+        Args:
+            dataset: the interactions.
+            ordered: which of them.
+            turns: what each set is seen after, [B, 3, 3]; sets must then share no cloud.
+            flips: whether the gripper is turned about its approach in each set, [B].
+        """
         rows, index = dataset.rows, ordered.rows
         clouds = dataset.clouds.select(ordered.clouds)
         xyz, frame, facts = rows.xyz[index], rows.frame[index], rows.facts[index]
@@ -129,7 +138,9 @@ class Batch:
             owner = torch.zeros(len(ordered.clouds), dtype=torch.long)
             owner[ordered.cloud.flatten()] = torch.arange(len(index)).repeat_interleave(index.shape[1])
             clouds = replace(clouds, points=turn_vectors(turns[owner], clouds.points))
-            xyz, frame, facts = turn_vectors(turns, xyz), turn_vectors(turns, frame), turn_facts(turns, facts)
+            xyz, frame, facts = turn_vectors(turns, xyz), turn_frames(turns, frame), turn_facts(turns, facts)
+        if flips is not None:
+            frame = flip_frames(flips, frame)
         point, motion, success = rows.point[index], rows.motion[index], rows.success[index]
         return cls(clouds, ordered.cloud, point, xyz, frame, motion, success, facts)
 

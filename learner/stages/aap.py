@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from learner.data.augmentation import draw_turns
+from learner.data.augmentation import draw_flips, draw_turns, flip_frames
 from learner.data.dataset import Dataset, Split
 from learner.data.features import FrozenFeatures
 from learner.data.sampling import Batch, OrderedRows, draw_numbers, order_rows, spread
@@ -42,7 +42,7 @@ class SeenRows:
     Attributes:
         features: of the points, [B, n, point_width].
         xyz: p less the middle of what may be moved, [B, n, 3].
-        frame: approach and forward, [B, n, 6].
+        frame: approach and forward, and the pinch profile where networks are told it, [B, n, 6 or more].
         motion: m, [B, n].
         success: r as 0 or 1, [B, n].
     """
@@ -139,9 +139,10 @@ class AapStage:
         ordered = order_rows(self.dataset, rollouts, config.rows_per_rollout, rng, config.continued_first)
         context = ordered.longest_context(config.context)
         turns = draw_turns(len(rollouts), config.augmentation, rng)
+        flips = draw_flips(len(rollouts), config.augmentation, rng)
         mine = share(len(rollouts))
         total, ordered = int(ordered.valid.sum()), ordered.select(mine)
-        seen = self._see(ordered, turns[mine])
+        seen = self._see(ordered, turns[mine], flips[mine])
         prediction = predict(self.aap, seen, context)
         asked = ordered.asked(context)
         losses = {"critic": action_scoring_loss(prediction.logits, seen.success[:, None], asked)}
@@ -180,14 +181,13 @@ class AapStage:
             figures |= {f"{name}_after_{tries}": getattr(found, name) for name in CURVE_FIGURES}
         return figures
 
-    def _see(self, ordered: OrderedRows, turns: Tensor | None = None) -> SeenRows:
-        """The rows, turned where their clouds are encoded anew."""
+    def _see(self, ordered: OrderedRows, turns: Tensor | None = None, flips: Tensor | None = None) -> SeenRows:
+        """The rows, flipped, and turned where their clouds are encoded anew."""
         if self._features is None:
-            return SeenRows.of(Batch.of(self.dataset, ordered, turns), self.aap.encoder)
+            return SeenRows.of(Batch.of(self.dataset, ordered, turns, flips), self.aap.encoder)
         index, rows = ordered.rows, self.dataset.rows
-        return SeenRows(
-            self._features[index], rows.xyz[index], rows.frame[index], rows.motion[index], rows.success[index]
-        )
+        frame = rows.frame[index] if flips is None else flip_frames(flips, rows.frame[index])
+        return SeenRows(self._features[index], rows.xyz[index], frame, rows.motion[index], rows.success[index])
 
 
 class OracleStage:
@@ -212,9 +212,10 @@ class OracleStage:
         chosen = draw_numbers(len(train), min(self.config.oracle_batch_rollouts, len(train)), rng)
         ordered = order_rows(self.dataset, [train[k] for k in chosen], self.config.rows_per_rollout, rng)
         turns = draw_turns(len(chosen), self.config.augmentation, rng)
+        flips = draw_flips(len(chosen), self.config.augmentation, rng)
         mine = share(len(chosen))
         total, ordered = int(ordered.valid.sum()), ordered.select(mine)
-        batch = Batch.of(self.dataset, ordered, turns[mine])
+        batch = Batch.of(self.dataset, ordered, turns[mine], flips[mine])
         loss = action_scoring_loss(self.critic.logits(batch), batch.success, ordered.valid)
         return StepResult({"critic": loss}, total)
 

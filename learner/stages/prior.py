@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from learner.data.augmentation import draw_turns, turn_vectors
+from learner.data.augmentation import draw_flips, draw_turns, flip_frames, turn_frames, turn_vectors
 from learner.data.dataset import Dataset, Split
 from learner.data.features import frozen_features
 from learner.data.sampling import draw_numbers, spread
@@ -52,12 +52,13 @@ class PriorStage:
         most = self.config.actions_per_cloud
         picked = [rng.permutation(self._rows_of_cloud[number])[:most] for number in chosen]
         turns = draw_turns(len(chosen), self.config.augmentation, rng)
+        flips = draw_flips(len(chosen), self.config.augmentation, rng)
         rows = np.concatenate(picked)
         noise = self._noise(rows, rng)
         mine = share(len(chosen))
         taken = np.isin(np.repeat(np.arange(len(picked)), [len(rows) for rows in picked]), np.arange(len(picked))[mine])
         noise = noise[torch.as_tensor(taken[self._succeeded[rows]])]
-        losses = self._losses(torch.as_tensor(rows[taken]), noise, turns[mine])
+        losses = self._losses(torch.as_tensor(rows[taken]), noise, turns[mine], flips[mine])
         return StepResult(losses, len(rows))
 
     @torch.no_grad()
@@ -86,15 +87,20 @@ class PriorStage:
         shape = (int(self._succeeded[rows].sum()), self.config.proposals, self.prior.config.noise_width)
         return torch.as_tensor(rng.standard_normal(shape).astype(np.float32))
 
-    def _losses(self, index: Tensor, noise: Tensor, turns: Tensor | None = None) -> dict[str, Tensor]:
-        """Both losses on rows, seen after a turn for each of their clouds, which are in order."""
+    def _losses(
+        self, index: Tensor, noise: Tensor, turns: Tensor | None = None, flips: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Both losses on rows, seen after a turn and a flip for each of their clouds, which are in order."""
         rows, prior = self.dataset.rows, self.prior
         clouds, cloud = torch.unique(rows.cloud[index], return_inverse=True)
         seen = self.dataset.clouds.select(clouds)
         xyz, frames, success = rows.xyz[index], rows.frame[index], rows.success[index]
         if turns is not None:
             seen = replace(seen, points=turn_vectors(turns, seen.points))
-            xyz, frames = (turn_vectors(turns[cloud], vectors[:, None])[:, 0] for vectors in (xyz, frames))
+            xyz = turn_vectors(turns[cloud], xyz[:, None])[:, 0]
+            frames = turn_frames(turns[cloud], frames[:, None])[:, 0]
+        if flips is not None:
+            frames = flip_frames(flips[cloud], frames[:, None])[:, 0]
         features = prior.encoder.at(prior.encoder(seen), cloud, rows.point[index])
         succeeded = success > 0
         proposals = prior.propose(features[succeeded][:, None], noise)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from learner.data.augmentation import draw_turns
+from learner.data.augmentation import draw_flips, draw_turns
 from learner.data.cached_features import FrozenAap, FrozenPrior
 from learner.data.dataset import Dataset, Split
 from learner.data.features import FrozenFeatures
@@ -76,9 +76,10 @@ class InteractionStage:
         chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
         ordered = self.order([train[number] for number in chosen], self.config.rows_per_rollout, rng)
         turns = draw_turns(len(chosen), self.config.augmentation, rng)
+        flips = draw_flips(len(chosen), self.config.augmentation, rng)
         mine = share(len(chosen))
         total, ordered = int(ordered.valid.sum()), ordered.select(mine)
-        logits, success, asked = self._predict(ordered, turns[mine])
+        logits, success, asked = self._predict(ordered, turns[mine], flips[mine])
         return StepResult({"critic": action_scoring_loss(logits, success, asked)}, total)
 
     @torch.no_grad()
@@ -104,9 +105,11 @@ class InteractionStage:
             orders.append(np.concatenate([rows[first], np.delete(rows, first)]))
         return padded(self.dataset, orders, size)
 
-    def _predict(self, ordered: OrderedRows, turns: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def _predict(
+        self, ordered: OrderedRows, turns: Tensor | None = None, flips: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Logits of all rows after the tries, successes, and which rows are no tries, [B, n] each."""
-        batch = Batch.of(self.dataset, ordered, turns)
+        batch = Batch.of(self.dataset, ordered, turns, flips)
         context = ordered.longest_context(TRIES)
         features = batch.features(self.network.encoder)
         tries = (features, batch.xyz, batch.frame, batch.motion, batch.success)

@@ -1,6 +1,7 @@
 """How actions and outcomes enter the networks: their numbers, in the view frame.
 
-A *frame* is the six numbers of a gripper's rotation: approach, then forward (Where2Act, by way of 6D rotations).
+A *frame* is the six numbers of a gripper's rotation: approach, then forward (Where2Act, by way of 6D rotations). Where
+`config.pinch_profile` is set, the pinch profile of the action follows in the same tensor (see `shared.pinch`).
 """
 
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from shared.networks.network_config import NetworkConfig
+from shared.pinch import BINS
 
 FRAME_WIDTH = 6
 MOTION_SCALE = 0.01
@@ -34,9 +36,10 @@ def action_inputs(points: Tensor, frames: Tensor, config: NetworkConfig) -> Tens
 
     Args:
         points: p less the middle, [..., 3], broadcast against the frames.
-        frames: approach and forward, [..., 6].
+        frames: approach and forward, [..., 6]; a profile that follows is not used.
         config: the sizes.
     """
+    frames = frames[..., :FRAME_WIDTH]
     if not config.action_features:
         return frames
     places = points.expand(*frames.shape[:-1], 3)
@@ -49,6 +52,21 @@ def in_gripper(offsets: Tensor, frames: Tensor) -> Tensor:
     approach, forward, across = _columns(frames)
     axes = torch.stack([forward, across, approach], dim=-1)
     return offsets @ axes
+
+
+def turned_over(frames: Tensor) -> Tensor:
+    """The same actions with the gripper turned by 180 deg about its approach, so that its fingers are swapped."""
+    turned = torch.cat([frames[..., :3], -frames[..., 3:FRAME_WIDTH], frames[..., FRAME_WIDTH:]], dim=-1)
+    return swapped_fingers(turned)
+
+
+def swapped_fingers(frames: Tensor) -> Tensor:
+    """Frames whose pinch profiles, where there are some, begin at the other finger."""
+    if frames.shape[-1] == FRAME_WIDTH:
+        return frames
+    frame, profile = frames[..., :FRAME_WIDTH], frames[..., FRAME_WIDTH:]
+    surface, there, rest = profile[..., :BINS], profile[..., BINS : 2 * BINS], profile[..., 2 * BINS :]
+    return torch.cat([frame, surface.flip(-1), there.flip(-1), rest], dim=-1)
 
 
 def middle_of(points: Tensor, movable: Tensor) -> Tensor:
@@ -105,7 +123,7 @@ def geodesic_distance(frames: Tensor, others: Tensor) -> Tensor:
 
 
 def _columns(frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    approach, forward = frames[..., :3], frames[..., 3:]
+    approach, forward = frames[..., :3], frames[..., 3:FRAME_WIDTH]
     return approach, forward, torch.linalg.cross(approach, forward)
 
 

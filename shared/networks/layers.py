@@ -6,8 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shared.networks.actions import PLACE_SCALE, action_inputs, action_width, in_gripper
+from shared.networks.actions import FRAME_WIDTH, PLACE_SCALE, action_inputs, action_width, in_gripper, turned_over
 from shared.networks.network_config import NetworkConfig
+from shared.pinch import PROFILE_WIDTH
 
 SURROUNDINGS_SCALE = 10.0
 """Offsets of the nearest points, some hundredths of a unit, come to some tenths."""
@@ -76,7 +77,7 @@ class ActionEncoder(nn.Module):
     """Encodes an action at a point into f_a (AdaAfford, Input Encoders).
 
     Deviation, where `config.surroundings` is set: the points around p are told as the gripper sees them, in its own
-    frame.
+    frame; where `config.pinch_profile` is set, what lies between its fingers as well.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -84,6 +85,7 @@ class ActionEncoder(nn.Module):
         self.config = config
         self.numbers = VectorEncoder(action_width(config), config)
         self.around = SurroundingsEncoder(config) if config.surroundings else None
+        self.pinch = VectorEncoder(PROFILE_WIDTH, config) if config.pinch_profile else None
 
     def forward(self, features: Tensor, points: Tensor, frames: Tensor) -> Tensor:
         """Actions to [..., feature_width]; leading axes broadcast.
@@ -91,12 +93,21 @@ class ActionEncoder(nn.Module):
         Args:
             features: all that is known of the points, [..., point_width].
             points: p less the middle of what may be moved, [..., 3].
-            frames: approach and forward, [..., 6].
+            frames: approach and forward, and the pinch profile where the configuration has it, [..., 6 or more].
         """
-        encoded = _as_tensor(self.numbers(action_inputs(points, frames, self.config)))
-        if self.around is None:
+        encoded = self._encoded(features, points, frames)
+        if not self.config.roll_symmetry:
             return encoded
-        return encoded + _as_tensor(self.around(in_gripper(surrounding_offsets(features, self.config), frames)))
+        return (encoded + self._encoded(features, points, turned_over(frames))) / 2
+
+    def _encoded(self, features: Tensor, points: Tensor, frames: Tensor) -> Tensor:
+        encoded = _as_tensor(self.numbers(action_inputs(points, frames, self.config)))
+        if self.around is not None:
+            offsets = in_gripper(surrounding_offsets(features, self.config), frames)
+            encoded = encoded + _as_tensor(self.around(offsets))
+        if self.pinch is not None:
+            encoded = encoded + _as_tensor(self.pinch(frames[..., FRAME_WIDTH:]))
+        return encoded
 
 
 class PlaceEncoder(nn.Module):

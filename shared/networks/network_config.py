@@ -49,6 +49,13 @@ class NetworkConfig(StrictModel):
     evidence: bool = True
     """Whether z is told how much was tried, beside the mean of what the tries say. As published: not."""
 
+    pinch_profile: bool = Field(False, exclude_if=lambda told: not told)
+    """Whether an action enters with what lies between the fingers, from the depth image (see `shared.pinch`); stores
+    need `collection.camera.keep_depth`, scans a point every centimetre. As published: not."""
+    roll_symmetry: bool = Field(False, exclude_if=lambda is_symmetric: not is_symmetric)
+    """Whether an action and the same with the gripper turned by 180 deg about its approach are encoded alike: as the
+    mean of both encodings. As published: not."""
+
     @property
     def point_width(self) -> int:
         """Of all that is known of a point: f_p|O, then the offsets of its surroundings (see `PointNet2.at`)."""

@@ -18,9 +18,10 @@ from torch import Tensor
 from shared.errors import UsageError
 from shared.geometry import gripper_rotation, points_in_view, view_from_world
 from shared.networks.aap import Aap
-from shared.networks.actions import middle_of
+from shared.networks.actions import FRAME_WIDTH, middle_of
 from shared.networks.grouping import group_cloud, nearest_points
 from shared.networks.pointnet2 import CloudBatch, EncodedClouds, PointNet2
+from shared.pinch import PROFILE_WIDTH, pinch_profiles
 from shared.policies.methods import ModuleName
 from shared.policies.policy import Policy
 from shared.types import Action, Float, Float32, Interaction, Observation
@@ -38,6 +39,7 @@ class _Entry:
     clouds: CloudBatch
     around: NDArray[np.int16]
     middle: Tensor
+    dense: Float32 | None
     encoded: dict[str, EncodedClouds]
 
 
@@ -47,7 +49,7 @@ class Proposals:
 
     Attributes:
         point: index of p.
-        frames: approach and forward, view frame, [S, 6].
+        frames: approach and forward, view frame, and the pinch profile where networks are told it, [S, 6 or more].
     """
 
     point: int
@@ -120,7 +122,7 @@ class Adapter:
         """The AAP scores s_u|z of actions after a history, [A], in [0, 1]."""
         indices = point_indices(actions)
         features = self.features(observation, module, indices)
-        points, frames = self.places(observation, indices), frames_in_view(observation, actions)
+        points, frames = self.places(observation, indices), self.frames(observation, actions)
         logits = self._adaptive(module).action_logits(features, points, frames, self.z(history, module))
         return torch.sigmoid(logits).numpy()
 
@@ -129,7 +131,7 @@ class Adapter:
         """Where2Act's scores of actions, [A], in [0, 1]."""
         indices = point_indices(actions)
         features = self.features(observation, "prior", indices)
-        points, frames = self.places(observation, indices), frames_in_view(observation, actions)
+        points, frames = self.places(observation, indices), self.frames(observation, actions)
         return torch.sigmoid(self.policy.prior.action_logits(features, points, frames)).numpy()
 
     @torch.inference_mode()
@@ -151,7 +153,27 @@ class Adapter:
         """Rotations at a point, from the prior's Action Proposal Network."""
         noise = rng.standard_normal((PROPOSALS, self.policy.config.noise_width)).astype(np.float32)
         features = self.features(observation, "prior", np.array([point]))
-        return Proposals(point, self.policy.prior.propose(features, torch.from_numpy(noise)))
+        frames = self.policy.prior.propose(features, torch.from_numpy(noise))
+        return Proposals(point, self._told(observation, np.full(len(frames), point), frames))
+
+    def frames(self, observation: Observation, actions: Sequence[Action]) -> Tensor:
+        """Actions as networks are told them: approach and forward, and the pinch profile where they are told it.
+
+        Returns:
+            [A, 6 or more], view frame.
+        """
+        return self._told(observation, point_indices(actions), frames_in_view(observation, actions))
+
+    def _told(self, observation: Observation, points: NDArray[np.int64], frames: Tensor) -> Tensor:
+        """Frames, [A, 6], at points given by index, [A], with pinch profiles where networks are told them."""
+        entry = self._entry(observation)
+        if entry.dense is None:
+            return frames
+        profiles = np.empty((len(frames), PROFILE_WIDTH), np.float32)
+        for point in np.unique(points):
+            here = points == point
+            profiles[here] = pinch_profiles(entry.dense, entry.clouds.points[0, point].numpy(), frames[here].numpy())
+        return torch.cat([frames, torch.from_numpy(profiles)], dim=-1)
 
     @torch.inference_mode()
     def score_proposals(
@@ -194,7 +216,8 @@ class Adapter:
             clouds = CloudBatch.of([points], [group_cloud(points, self.policy.config)])
             middle = middle_of(clouds.points[0], torch.from_numpy(observation.movable))
             around = nearest_points(points, self.policy.config.surroundings)
-            entry = self._entries[id(observation)] = _Entry(observation, clouds, around, middle, {})
+            dense = dense_in_view(observation) if self.policy.config.pinch_profile else None
+            entry = self._entries[id(observation)] = _Entry(observation, clouds, around, middle, dense, {})
             if len(self._entries) > MAX_CACHED_OBSERVATIONS:
                 self._entries.popitem(last=False)
         self._entries.move_to_end(id(observation))
@@ -221,7 +244,7 @@ class Adapter:
         return self._adaptive(module).interaction_codes(
             self.features(interaction.observation, module, index),
             self.places(interaction.observation, index),
-            frames_in_view(interaction.observation, [interaction.action]),
+            self.frames(interaction.observation, [interaction.action]),
             torch.tensor([interaction.outcome.motion], dtype=torch.float32),
             torch.tensor([float(interaction.outcome.success)]),
         )
@@ -239,6 +262,21 @@ def movable_points(observation: Observation) -> NDArray[np.int64]:
     return points
 
 
+def dense_in_view(observation: Observation) -> Float32:
+    """The surface at the full resolution of its sensor, [M, 3], view frame.
+
+    Raises:
+        UsageError: it was not kept.
+    """
+    if observation.dense is None:
+        raise UsageError(
+            "the policy is told what lies between the fingers, and the observation keeps no depth image; collect with "
+            "--collection.camera.keep-depth"
+        )
+    view = view_from_world(observation.world_from_camera).astype(np.float32)
+    return observation.dense.points() @ view.T
+
+
 def point_indices(actions: Sequence[Action]) -> NDArray[np.int64]:
     """Indices of the points that actions touch, [A]."""
     return np.array([action.point_index for action in actions], dtype=np.int64)
@@ -254,7 +292,7 @@ def frames_in_view(observation: Observation, actions: Sequence[Action]) -> Tenso
 def action_from_frame(observation: Observation, point: int, frame: Tensor) -> Action:
     """The action at a point of the observation whose approach and forward, [6], are given in the view frame."""
     view = view_from_world(observation.world_from_camera)
-    approach, forward = frame.double().numpy().reshape(2, 3) @ view
+    approach, forward = frame[:FRAME_WIDTH].double().numpy().reshape(2, 3) @ view
     approach /= np.linalg.norm(approach)
     rotation: Float = gripper_rotation(approach, forward)
     return Action(point, observation.points[point].astype(np.float64), rotation)

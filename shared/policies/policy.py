@@ -10,7 +10,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from shared.config import StrictModel
+from shared.config import CameraConfig, StrictModel
 from shared.errors import StoreError, UsageError
 from shared.io.documents import parse_document, parse_object
 from shared.io.text import MAX_WORD, plain
@@ -114,6 +114,18 @@ class Policy:
         """This policy, with `name` counted among the trained modules from here on."""
         self.trained |= {name}
         return self
+
+    def check_camera(self, camera: CameraConfig) -> None:
+        """Check that a camera keeps what the networks are told.
+
+        Raises:
+            UsageError: they are told pinch profiles, and it keeps no depth images.
+        """
+        if self.config.pinch_profile and not camera.keep_depth:
+            raise UsageError(
+                "this policy is told what lies between the fingers, and these settings keep no depth images; set "
+                "collection.camera.keep_depth"
+            )
 
     def require(self, *names: ModuleName) -> None:
         """Check that modules have been trained.

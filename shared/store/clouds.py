@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from shared.config import CameraConfig
 from shared.errors import StoreError, UsageError
-from shared.store.codecs.observations import ARRAYS, ObservationArrays
+from shared.store.codecs.observations import ObservationArrays, fields_of, kinds
 from shared.types import Observation
 
 if TYPE_CHECKING:
@@ -38,11 +39,12 @@ def observations_at(store: "Store", places: Iterable[tuple[str, int]]) -> Iterat
         yield arrays.observation(index)
 
 
-def stacked(found: Iterable[Observation], count: int, points: int) -> ObservationArrays:
-    """`count` clouds of `points` as arrays."""
+def stacked(found: Iterable[Observation], count: int, camera: CameraConfig) -> ObservationArrays:
+    """`count` observations of a camera as arrays, with their depth images where it keeps them."""
     # Filled one by one, since a list of so many arrays would be in memory beside what they are stacked into.
-    arrays = {kind.name: np.empty((count, *kind.shape(points)), kind.seen) for kind in ARRAYS}
+    pixels = camera.image_size if camera.keep_depth else 0
+    arrays = {kind.name: np.empty((count, *kind.shape(camera.points, pixels)), kind.seen) for kind in kinds(pixels)}
     for number, observation in enumerate(found):
-        for name, array in arrays.items():
-            array[number] = getattr(observation, name)
+        for name, field in fields_of(observation).items():
+            arrays[name][number] = field
     return ObservationArrays(**arrays)

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from shared.config import StrictModel
+from shared.config import MAX_DEPTH_SIZE, StrictModel
 from shared.errors import SchemaVersionError, StoreError
 from shared.io.documents import MAX_VALUES, parse_object, problem_of
 from shared.plan import Job, Setting
@@ -33,6 +33,8 @@ SCHEMA_VERSION = 1
 """What the number promises, and when it grows, is told in docs/compatibility.md."""
 HIDDEN_VERSION = 2
 """Of stores with further hidden parameters: software that knows version 1 alone would compute another digest."""
+DEPTH_VERSION = 3
+"""Of stores that keep depth images, with or without further hidden parameters: older software does not know them."""
 STORE_FILE = "store.json"
 MANIFEST_FILE = "manifest.json"
 INTERACTIONS_FILE = "interactions.parquet"
@@ -50,8 +52,9 @@ MAX_DOCUMENT_BYTES = 64 << 20
 MAX_ROWS = 1 << 16
 MAX_POINTS = 1 << 14
 MAX_ALL_POINTS = 1 << 25
-"""Bounds of one shard: rollouts, interactions and observations; N; and points of all clouds. A hostile manifest
-cannot ask for unbounded work."""
+MAX_ALL_PIXELS = 1 << 29
+"""Bounds of one shard: rollouts, interactions and observations; N; points of all clouds; pixels of all depth images. A
+hostile manifest cannot ask for unbounded work."""
 
 MAX_MANIFEST_VALUES = 6 * MAX_ROWS
 """A digest of each rollout, four values where it was given up, and the files."""
@@ -65,8 +68,10 @@ PLAN_KEY = r"[a-z][a-z0-9-]{0,30}-v[0-9]{1,9}"
 _SHARD_ID = re.compile(rf"(?P<plan>{PLAN_KEY})-(?P<start>[0-9]{{8,12}})-(?P<stop>[0-9]{{8,12}})")
 
 
-def schema_version(added: Sequence[str]) -> int:
-    """The version of documents about rollouts with some hidden parameters that not every store has."""
+def schema_version(added: Sequence[str], keeps_depth: bool) -> int:
+    """The version of documents about rollouts with hidden parameters that not every store has, or with depth images."""
+    if keeps_depth:
+        return DEPTH_VERSION
     return HIDDEN_VERSION if added else SCHEMA_VERSION
 
 
@@ -98,6 +103,8 @@ class ShardManifest(StrictModel):
     observations: int = Field(ge=0, le=MAX_ROWS)
     points: int = Field(ge=1, le=MAX_POINTS)
     """N, of every cloud."""
+    depth_size: int = Field(0, ge=0, le=MAX_DEPTH_SIZE, exclude_if=lambda size: size == 0)
+    """Width and height of every depth image; 0 where none is kept."""
     files: dict[str, FileEntry]
     """By path within the shard; all but the manifest itself."""
     digests: tuple[str, ...] = Field(max_length=MAX_ROWS)
@@ -115,6 +122,10 @@ class ShardManifest(StrictModel):
             raise ValueError("a digest is not a SHA-256")
         if self.observations * self.points > MAX_ALL_POINTS:
             raise ValueError(f"{self.observations} clouds of {self.points} points; allowed: {MAX_ALL_POINTS} points")
+        if self.observations * self.depth_size**2 > MAX_ALL_PIXELS:
+            raise ValueError(
+                f"{self.observations} depth images of {self.depth_size} pixels square; allowed: {MAX_ALL_PIXELS} pixels"
+            )
         if not all(self.start <= each.rollout < self.stop for each in self.quarantined):
             raise ValueError("a rollout of another shard is quarantined")
         return self
@@ -140,11 +151,15 @@ class ShardManifest(StrictModel):
         return sum(entry.size for entry in self.files.values())
 
 
+def _version_of(setting: Setting) -> int:
+    return schema_version(setting.dynamics.added, setting.collection.camera.keep_depth)
+
+
 class StoreDocument(StrictModel):
     """What store.json says."""
 
     setting: Setting
-    schema_version: int = Field(default_factory=lambda data: schema_version(data["setting"].dynamics.added))
+    schema_version: int = Field(default_factory=lambda data: _version_of(data["setting"]))
     software: dict[str, str]
     created: str
     """UTC, ISO 8601."""
@@ -194,7 +209,7 @@ def check_schema_version(content: dict[str, Any], source: str) -> None:
         StoreError: it names no version, or was damaged where it names it.
     """
     version = content.get("schema_version")
-    versions = (SCHEMA_VERSION, HIDDEN_VERSION)
+    versions = (SCHEMA_VERSION, HIDDEN_VERSION, DEPTH_VERSION)
     if version in versions and type(version) is int:
         return
     # A flipped bit in the number itself is damage: with the right number, the document is what was sealed.
@@ -206,7 +221,7 @@ def check_schema_version(content: dict[str, Any], source: str) -> None:
         else "use the software that wrote it, or newer"
     )
     raise SchemaVersionError(
-        f"{source}: schema version {version}, but this software reads {SCHEMA_VERSION} and {HIDDEN_VERSION}; {older}"
+        f"{source}: schema version {version}, but this software reads {SCHEMA_VERSION} to {DEPTH_VERSION}; {older}"
     )
 
 

@@ -116,7 +116,7 @@ def checked_manifest(shard: Folder, data: bytes) -> ShardManifest:
 
 def expected_files(manifest: ShardManifest) -> dict[str, int]:
     """Paths of all files that the shard must have, and the most bytes each may have, from the counts alone."""
-    clouds = observations.file_limits(manifest.observations, manifest.points)
+    clouds = observations.file_limits(manifest.observations, manifest.points, manifest.depth_size)
     return {
         ROLLOUTS_FILE: size_limit(manifest.rollouts),
         INTERACTIONS_FILE: size_limit(manifest.interactions),
@@ -245,7 +245,8 @@ def read_observations(shard: Folder, manifest: ShardManifest) -> ObservationArra
     names = [name for name in manifest.files if name.startswith(prefix)]
     contents = _read_files(shard, manifest, names)
     files = {name.removeprefix(prefix): data for name, data in zip(names, contents, strict=True)}
-    return observations.decode(files, manifest.observations, manifest.points, f"{shard}/{OBSERVATIONS_FOLDER}")
+    sizes = (manifest.observations, manifest.points, manifest.depth_size)
+    return observations.decode(files, *sizes, f"{shard}/{OBSERVATIONS_FOLDER}")
 
 
 def read_rollouts(shard: Folder, manifest: ShardManifest) -> tuple[RolloutRecord, ...]:

@@ -270,8 +270,14 @@ class Store:
                 raise StoreError(
                     f"{job.shard_id}: rollout {rollout.index} has other hidden parameters than the store's"
                 )
-        points = self.setting.collection.camera.points
-        return commit_shard(self.backend, job, rollouts, points, provenance, quarantined, vetted=vetted)
+        camera = self.setting.collection.camera
+        kept = camera.keep_depth
+        if any((seen.dense is not None) != kept for rollout in rollouts for seen in rollout.observations):
+            raise StoreError(
+                f"{job.shard_id}: a simulator must keep the depth image of each observation if, and only if, "
+                f"collection.camera.keep_depth is set; here it is {str(kept).lower()}"
+            )
+        return commit_shard(self.backend, job, rollouts, camera.points, provenance, quarantined, vetted=vetted)
 
     def only_driver(self, *, alone: bool = False) -> AbstractContextManager[Any]:
         """Hold the store against other drivers, which would do everything twice.
@@ -387,7 +393,7 @@ class Store:
 
     def clouds(self, rows: Any) -> ObservationArrays:
         """The clouds of all rows of a table of interactions as arrays, [rows, ...]; as `observations` otherwise."""
-        return stacked(self.observations(rows), len(rows), self.setting.collection.camera.points)
+        return stacked(self.observations(rows), len(rows), self.setting.collection.camera)
 
     def cloud_batches(self, rows: Any, size: int) -> Iterator[tuple[Any, ObservationArrays]]:
         """At most `size` rows at a time and their clouds, in order; as `observations` otherwise.
@@ -400,7 +406,7 @@ class Store:
         found = self.observations(rows)
         for start in range(0, len(rows), size):
             some = rows.slice(start, size)
-            yield some, stacked(islice(found, len(some)), len(some), self.setting.collection.camera.points)
+            yield some, stacked(islice(found, len(some)), len(some), self.setting.collection.camera)
 
     def read_rollouts(self, shard_id: str) -> tuple[RolloutRecord, ...]:
         """The records of a shard, bit for bit as they were committed.

@@ -10,8 +10,8 @@ from shared.hidden import ALWAYS_DRAWN
 from shared.plan import Job
 from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.store.codecs.columns import MAX_TEXT
-from shared.store.codecs.observations import check_observation
-from shared.store.layout import MAX_ALL_POINTS, MAX_ROWS, Quarantined
+from shared.store.codecs.observations import check_observation, depth_size
+from shared.store.layout import MAX_ALL_PIXELS, MAX_ALL_POINTS, MAX_ROWS, Quarantined
 from shared.types import Float
 
 MAX_PARTS = 255
@@ -34,7 +34,11 @@ def check_rollouts(rollouts: Sequence[RolloutRecord], job: Job, points: int, sou
         raise StoreError(f"{source}: needs rollouts {job.start} to {job.stop - 1}, each once and in order")
     clouds = sum(len(rollout.observations) for rollout in rollouts)
     tries = sum(len(rollout.interactions) for rollout in rollouts)
-    if clouds * points > MAX_ALL_POINTS or max(clouds, tries, len(rollouts)) > MAX_ROWS:
+    try:
+        pixels = clouds * depth_size(seen for rollout in rollouts for seen in rollout.observations) ** 2
+    except ValueError as error:
+        raise StoreError(f"{source}: {error}") from None
+    if clouds * points > MAX_ALL_POINTS or pixels > MAX_ALL_PIXELS or max(clouds, tries, len(rollouts)) > MAX_ROWS:
         raise StoreError(
             f"{source}: {clouds} clouds and {tries} interactions are too many for one shard; divide the job"
         )

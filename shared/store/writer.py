@@ -81,15 +81,17 @@ def commit_shard(
     check_quarantined(rollouts, quarantined, job.shard_id)
     unknown = unknown or Unknown({}, {})
     clouds = [[observations.pack(observation) for observation in rollout.observations] for rollout in rollouts]
-    files = _encode(rollouts, clouds, points, unknown.tables)
+    pixels = observations.depth_size(observation for rollout in rollouts for observation in rollout.observations)
+    files = _encode(rollouts, clouds, points, pixels, unknown.tables)
     manifest = ShardManifest(
-        schema_version=schema_version(rollouts[0].dynamics.added),
+        schema_version=schema_version(rollouts[0].dynamics.added, pixels > 0),
         plan_key=job.plan_key,
         start=job.start,
         stop=job.stop,
         interactions=sum(len(rollout.interactions) for rollout in rollouts),
         observations=sum(len(rollout.observations) for rollout in rollouts),
         points=points,
+        depth_size=pixels,
         files=_entries(files),
         digests=tuple(map(rollout_digest, rollouts, clouds)),
         software=store_software(),
@@ -171,6 +173,7 @@ def _encode(
     rollouts: Sequence[RolloutRecord],
     clouds: Sequence[Sequence[observations.Packed]],
     points: int,
+    pixels: int,
     unknown: Mapping[str, Any],
 ) -> dict[str, bytes]:
     """All files of a shard but its manifest, by path within it; `clouds` are the observations of each rollout."""
@@ -180,7 +183,7 @@ def _encode(
         interaction_rows += [InteractionRow(rollout, interaction, first) for interaction in rollout.interactions]
         first += len(rollout.observations)
     added = rollouts[0].dynamics.added
-    group = observations.encode([cloud for of_rollout in clouds for cloud in of_rollout], points)
+    group = observations.encode([cloud for of_rollout in clouds for cloud in of_rollout], points, pixels)
     return {
         ROLLOUTS_FILE: table_bytes(rollout_columns(added), rollout_rows, unknown.get(ROLLOUTS_FILE)),
         INTERACTIONS_FILE: table_bytes(interaction_columns(added), interaction_rows, unknown.get(INTERACTIONS_FILE)),

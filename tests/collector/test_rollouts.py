@@ -326,6 +326,20 @@ def test_edges_are_found_where_the_part_ends() -> None:
     assert all(action is not None and action.point_index in edges for action in proposed)
 
 
+def test_a_depth_image_is_kept_beside_the_same_cloud() -> None:
+    kept = CameraConfig(keep_depth=True)
+    image = EmbreeCamera(door(), FRONT, kept).capture(np.zeros(1))
+    plain, cloud = (
+        observation_from(image, FRONT, (1,), config, np.random.default_rng(0)) for config in (CameraConfig(), kept)
+    )
+    assert plain is not None and plain.dense is None
+    assert cloud is not None and cloud.dense is not None
+    assert np.array_equal(cloud.points, plain.points)
+    dense = cloud.dense.points()
+    assert len(dense) == len(image.pixels)
+    np.testing.assert_allclose(dense, image.points, atol=1e-3)
+
+
 def test_an_unknown_method_is_refused_with_those_there_are() -> None:
     with pytest.raises(UsageError, match="ours-final"):
         method_named("ours-fianl")

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
+from shared.depth import DepthMap
 from shared.geometry import camera_pose, gripper_rotation
 from shared.observation import round_normals, round_points
 from shared.plan import Job, ObjectRef, Plan, Setting
@@ -36,8 +37,8 @@ from shared.types import (
 )
 
 
-def fabricate_setting(objects: int = 3, points: int = 64, seed: int = 7) -> Setting:
-    """A setting of `objects` objects of two categories."""
+def fabricate_setting(objects: int = 3, points: int = 64, seed: int = 7, keep_depth: bool = False) -> Setting:
+    """A setting of `objects` objects of two categories; depth images that are kept are small."""
     refs = tuple(
         ObjectRef(
             id=f"object-{k}",
@@ -46,7 +47,10 @@ def fabricate_setting(objects: int = 3, points: int = 64, seed: int = 7) -> Sett
         )
         for k in range(objects)
     )
-    collection = CollectionConfig(camera=CameraConfig(points=points), rollout=RolloutConfig(interactions=32))
+    collection = CollectionConfig(
+        camera=CameraConfig(points=points, keep_depth=keep_depth, image_size=32 if keep_depth else 448),
+        rollout=RolloutConfig(interactions=32),
+    )
     return Setting(task="push", seed=seed, objects=refs, collection=collection)
 
 
@@ -58,9 +62,12 @@ def fabricate_rollout(plan: Plan, index: int, interactions: int = 8, per_observa
     parts = int(rng.integers(1, 5))
     pose = camera_pose(azimuth, elevation, 5.0)
     clouds = -(-interactions // per_observation)
-    observations = tuple(
-        fabricate_observation(rng, setting.collection.camera.points, pose, parts) for _ in range(clouds)
-    )
+    camera = setting.collection.camera
+    observations = tuple(fabricate_observation(rng, camera.points, pose, parts) for _ in range(clouds))
+    if camera.keep_depth:
+        observations = tuple(
+            dataclasses.replace(seen, dense=fabricate_depth(rng, camera.image_size, pose)) for seen in observations
+        )
     return RolloutRecord(
         index=index,
         plan_key=plan.key,
@@ -105,6 +112,12 @@ def fabricate_observation(rng: np.random.Generator, points: int, pose: np.ndarra
         pixels=rng.choice(448 * 448, points, replace=False).astype(np.uint32),
         world_from_camera=pose,
     )
+
+
+def fabricate_depth(rng: np.random.Generator, size: int, pose: np.ndarray) -> DepthMap:
+    """A depth map of a rough surface that is some centimetres from pixel to pixel and fills most of the image."""
+    pixels = np.flatnonzero(rng.random(size * size) < 0.9).astype(np.uint32)
+    return DepthMap.of(pixels, rng.uniform(4.4, 4.6, len(pixels)), size, 5.0 * size / 1.6, pose)
 
 
 def fabricate_interaction(

@@ -4,13 +4,14 @@ Zarr writes to a dictionary here and the shard writer puts that on the disk, sin
 disk. Reading does without Zarr: the manifest says what each file must be, so that no claim of the metadata is followed,
 and a chunk's header is checked before the decoder, which believes it, sees the chunk.
 
-Shapes: O observations of a shard, N points of a cloud.
+Shapes: O observations of a shard, N points of a cloud, S pixels of a row and of a column of a depth image. S is 0 in a
+shard without depth images, which lacks the arrays that describe them.
 """
 
 import json
 import math
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from zarr.codecs import BloscCodec
 from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
+from shared.depth import DepthMap, pack_steps, unpack_steps
 from shared.errors import StoreError
 from shared.io.documents import parse_object
 from shared.io.text import plain
@@ -56,13 +58,20 @@ class ObservationArrays:
     """[O, N]."""
     world_from_camera: Float
     """[O, 4, 4]."""
+    depth: NDArray[np.uint16] | None = None
+    """[O, S, S], the steps of depth maps (see `shared.depth.DepthMap`)."""
+    focal: Float | None = None
+    """[O, 1], of the depth maps."""
 
     def __len__(self) -> int:
         return len(self.points)
 
     def observation(self, index: int) -> Observation:
         """One of them; its arrays are views of these."""
-        return Observation(**{array.name: getattr(self, array.name)[index] for array in ARRAYS})
+        dense = None
+        if self.depth is not None and self.focal is not None:
+            dense = DepthMap(self.depth[index], self.focal[index], self.world_from_camera[index])
+        return Observation(**{array.name: getattr(self, array.name)[index] for array in ARRAYS}, dense=dense)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +82,7 @@ class ArrayKind:
         name: of the array, and of the field of `Observation`.
         seen: numpy type that an observation has.
         kept: numpy type that is stored.
-        tail: shape after [O]; 0 stands for N.
+        tail: shape after [O]; `_POINTS` stands for N and `_PIXELS` for S.
         description: for the array's attributes.
     """
 
@@ -83,42 +92,83 @@ class ArrayKind:
     tail: tuple[int, ...]
     description: str
 
-    def shape(self, points: int) -> tuple[int, ...]:
-        """Shape of one observation's field, for clouds of `points`."""
-        return tuple(size or points for size in self.tail)
+    def shape(self, points: int, pixels: int) -> tuple[int, ...]:
+        """Shape of one observation's field, for clouds of `points` and depth images of `pixels` a row."""
+        return tuple({_POINTS: points, _PIXELS: pixels}.get(size, size) for size in self.tail)
 
-    def chunk(self, observations: int, points: int) -> tuple[int, ...]:
+    def chunk(self, observations: int, points: int, pixels: int) -> tuple[int, ...]:
         """Shape of a chunk: everything, unless that were too large."""
-        shape = self.shape(points)
+        shape = self.shape(points, pixels)
         most = MAX_CHUNK_BYTES // (math.prod(shape) * np.dtype(self.kept).itemsize)
         return (max(1, min(observations, most)), *shape)
 
-    def chunk_bytes(self, observations: int, points: int) -> int:
+    def chunk_bytes(self, observations: int, points: int, pixels: int) -> int:
         """Size of a chunk, unpacked; the last one is as large as the others."""
-        return math.prod(self.chunk(observations, points)) * np.dtype(self.kept).itemsize
+        return math.prod(self.chunk(observations, points, pixels)) * np.dtype(self.kept).itemsize
 
-    def chunk_files(self, observations: int, points: int) -> list[str]:
+    def chunk_files(self, observations: int, points: int, pixels: int) -> list[str]:
         """Paths within the group of all chunks, in order."""
-        count = -(-observations // self.chunk(observations, points)[0])
+        count = -(-observations // self.chunk(observations, points, pixels)[0])
         return [f"{self.name}/c.{number}{'.0' * len(self.tail)}" for number in range(count)]
 
     def pack(self, seen: NDArray[Any]) -> NDArray[Any]:
         """What is stored, for a field as an observation has it."""
-        return pack_normals(seen) if self.name == "normals" else seen.astype(self.kept)
+        match self.name:
+            case "normals":
+                return pack_normals(seen)
+            case "depth":
+                return pack_steps(seen)
+            case _:
+                return seen.astype(self.kept)
 
     def unpack(self, kept: NDArray[Any]) -> NDArray[Any]:
         """The field as an observation has it."""
-        return unpack_normals(kept) if self.name == "normals" else kept.astype(self.seen)
+        match self.name:
+            case "normals":
+                return unpack_normals(kept)
+            case "depth":
+                return unpack_steps(kept)
+            case _:
+                return kept.astype(self.seen)
 
 
+_POINTS, _PIXELS = 0, -1
 ARRAYS = (
-    ArrayKind("points", "<f4", "<f2", (0, 3), "world frame, furthest-point order"),
-    ArrayKind("normals", "<f4", "|i1", (0, 3), f"world frame, times {NORMAL_STEPS}"),
-    ArrayKind("part_ids", "|u1", "|u1", (0,), "0: static body; k: k-th movable part"),
-    ArrayKind("movable", "|b1", "|b1", (0,), "whether the task may act on the point"),
-    ArrayKind("pixels", "<u4", "<u4", (0,), "row * image width + column"),
+    ArrayKind("points", "<f4", "<f2", (_POINTS, 3), "world frame, furthest-point order"),
+    ArrayKind("normals", "<f4", "|i1", (_POINTS, 3), f"world frame, times {NORMAL_STEPS}"),
+    ArrayKind("part_ids", "|u1", "|u1", (_POINTS,), "0: static body; k: k-th movable part"),
+    ArrayKind("movable", "|b1", "|b1", (_POINTS,), "whether the task may act on the point"),
+    ArrayKind("pixels", "<u4", "<u4", (_POINTS,), "row * image width + column"),
     ArrayKind("world_from_camera", "<f8", "<f8", (4, 4), "pose of the camera: x forward, y left, z up"),
 )
+DEPTH_ARRAYS = (
+    ArrayKind("depth", "<u2", "<u2", (_PIXELS, _PIXELS), "depth image as shared.depth.pack_steps writes it"),
+    ArrayKind("focal", "<f8", "<f8", (1,), "focal length of the depth image, pixels"),
+)
+"""Of shards with depth images alone."""
+
+
+def kinds(pixels: int) -> tuple[ArrayKind, ...]:
+    """The arrays of a shard with depth images of `pixels` a row; 0: without."""
+    return (*ARRAYS, *DEPTH_ARRAYS) if pixels else ARRAYS
+
+
+def depth_size(observations: Iterable[Observation]) -> int:
+    """S of the depth images that observations keep; 0: none keeps one.
+
+    Raises:
+        ValueError: only some keep one, or not all are of one size.
+    """
+    sizes = {0 if each.dense is None else len(_depth_map(each).steps) for each in observations}
+    if len(sizes) > 1:
+        raise ValueError(f"observations keep depth images of several sizes, {sorted(sizes)}; 0 is none")
+    return sizes.pop() if sizes else 0
+
+
+def _depth_map(observation: Observation) -> DepthMap:
+    if not isinstance(observation.dense, DepthMap):
+        raise ValueError(f"observation's dense geometry is a {type(observation.dense).__name__}, not a depth map")
+    return observation.dense
 
 
 def check_observation(observation: Observation, points: int) -> None:
@@ -127,17 +177,31 @@ def check_observation(observation: Observation, points: int) -> None:
     Raises:
         ValueError: a wrong shape or type, a number that is not finite, or a cloud that was not rounded.
     """
-    for array in ARRAYS:
-        field = getattr(observation, array.name)
-        if field.dtype != np.dtype(array.seen) or field.shape != array.shape(points):
-            given = f"{field.dtype} {field.shape}"
-            raise ValueError(f"observation's {array.name} is {given}, needs {array.seen} {array.shape(points)}")
+    fields = fields_of(observation)
+    pixels = len(fields["depth"]) if "depth" in fields else 0
+    for array in kinds(pixels):
+        field, shape = fields[array.name], array.shape(points, pixels)
+        if field.dtype != np.dtype(array.seen) or field.shape != shape:
+            raise ValueError(f"observation's {array.name} is {field.dtype} {field.shape}, needs {array.seen} {shape}")
         if field.dtype.kind == "f" and not np.isfinite(field).all():
             raise ValueError(f"observation's {array.name} holds a number that is not finite")
     if not np.array_equal(observation.points, round_points(observation.points)):
         raise ValueError("observation's points are not rounded to float16 (see shared.observation)")
     if not np.array_equal(observation.normals, round_normals(observation.normals)):
         raise ValueError("observation's normals are not rounded (see shared.observation)")
+    if pixels and not fields["focal"] > 0:
+        raise ValueError(f"observation's focal length is {fields['focal']}; it is positive")
+    if pixels and not np.array_equal(_depth_map(observation).world_from_camera, observation.world_from_camera):
+        raise ValueError("observation's depth image is of another camera than its cloud")
+
+
+def fields_of(observation: Observation) -> dict[str, NDArray[Any]]:
+    """What is stored of an observation, by the name of the array."""
+    fields = {kind.name: getattr(observation, kind.name) for kind in ARRAYS}
+    if observation.dense is not None:
+        dense = _depth_map(observation)
+        fields |= {"depth": dense.steps, "focal": dense.focal}
+    return fields
 
 
 Packed = Mapping[str, NDArray[Any]]
@@ -146,22 +210,23 @@ Packed = Mapping[str, NDArray[Any]]
 
 def pack(observation: Observation) -> Packed:
     """An observation as it is stored: for the arrays of the group, and for the content digest."""
-    return {kind.name: kind.pack(getattr(observation, kind.name)) for kind in ARRAYS}
+    fields = fields_of(observation)
+    return {kind.name: kind.pack(fields[kind.name]) for kind in (*ARRAYS, *DEPTH_ARRAYS) if kind.name in fields}
 
 
-def encode(observations: Sequence[Packed], points: int) -> dict[str, bytes]:
+def encode(observations: Sequence[Packed], points: int, pixels: int) -> dict[str, bytes]:
     """The files of the group, by path within it."""
     memory: dict[str, Buffer] = {}
     group = zarr.create_group(MemoryStore(memory), zarr_format=3)
-    for kind in ARRAYS:
-        data = np.empty((len(observations), *kind.shape(points)), kind.kept)
+    for kind in kinds(pixels):
+        data = np.empty((len(observations), *kind.shape(points, pixels)), kind.kept)
         for k, observation in enumerate(observations):
             data[k] = observation[kind.name]
         array = group.create_array(
             kind.name,
             shape=data.shape,
             dtype=data.dtype,
-            chunks=kind.chunk(len(observations), points),
+            chunks=kind.chunk(len(observations), points, pixels),
             filters=None,
             compressors=BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"),
             chunk_key_encoding={"name": "default", "separator": "."},
@@ -177,23 +242,24 @@ def encode(observations: Sequence[Packed], points: int) -> dict[str, bytes]:
     return files | {path: json.dumps(one, separators=(",", ":")).encode() for path, one in metadata.items()}
 
 
-def file_limits(observations: int, points: int) -> Iterator[tuple[str, int]]:
+def file_limits(observations: int, points: int, pixels: int) -> Iterator[tuple[str, int]]:
     """Paths within the group of all the files that a shard of this size has, and the most bytes that each may have."""
     yield _GROUP_FILE, MAX_METADATA_BYTES
-    for kind in ARRAYS:
+    for kind in kinds(pixels):
         yield f"{kind.name}/{_GROUP_FILE}", MAX_METADATA_BYTES
         # Data that cannot be compressed grow by a header.
-        most = kind.chunk_bytes(observations, points) + _BLOSC_HEADER.size
-        yield from ((path, most) for path in kind.chunk_files(observations, points))
+        most = kind.chunk_bytes(observations, points, pixels) + _BLOSC_HEADER.size
+        yield from ((path, most) for path in kind.chunk_files(observations, points, pixels))
 
 
-def decode(files: Mapping[str, bytes], observations: int, points: int, source: str) -> ObservationArrays:
+def decode(files: Mapping[str, bytes], observations: int, points: int, pixels: int, source: str) -> ObservationArrays:
     """The arrays of a group from hostile files.
 
     Args:
         files: those that `file_limits` names, by path within the group.
         observations: O.
         points: N.
+        pixels: S.
         source: what messages call the group.
 
     Raises:
@@ -203,25 +269,27 @@ def decode(files: Mapping[str, bytes], observations: int, points: int, source: s
     if group.get("node_type") != "group" or group.get("consolidated_metadata") is not None:
         raise StoreError(f"{source}: its Zarr metadata are not a plain group's; the file is damaged or foreign")
     arrays = ObservationArrays(
-        **{kind.name: _decode_array(files, kind, observations, points, source) for kind in ARRAYS}
+        **{kind.name: _decode_array(files, kind, observations, points, pixels, source) for kind in kinds(pixels)}
     )
     axes = arrays.world_from_camera[:, :3, :3]
     if not np.isfinite(arrays.points).all() or not np.isfinite(arrays.world_from_camera).all():
         raise StoreError(f"{source}: holds numbers that are not finite; the file is damaged or foreign")
+    if arrays.focal is not None and not (np.isfinite(arrays.focal) & (arrays.focal > 0)).all():
+        raise StoreError(f"{source}/focal: holds numbers that are no focal lengths; the file is damaged or foreign")
     if (np.abs(axes @ axes.transpose(0, 2, 1) - np.eye(3)) > RIGID).any():
         raise StoreError(f"{source}/world_from_camera: is no pose of a camera; the file is damaged or foreign")
     return arrays
 
 
 def _decode_array(
-    files: Mapping[str, bytes], kind: ArrayKind, observations: int, points: int, source: str
+    files: Mapping[str, bytes], kind: ArrayKind, observations: int, points: int, pixels: int, source: str
 ) -> NDArray[Any]:
     where = f"{source}/{kind.name}"
-    _check_metadata(files[f"{kind.name}/{_GROUP_FILE}"], kind, observations, points, where)
-    size = kind.chunk_bytes(observations, points)
-    kept = np.empty((observations, *kind.shape(points)), kind.kept)
-    rows = kind.chunk(observations, points)[0]
-    for number, path in enumerate(kind.chunk_files(observations, points)):
+    _check_metadata(files[f"{kind.name}/{_GROUP_FILE}"], kind, observations, points, pixels, where)
+    size = kind.chunk_bytes(observations, points, pixels)
+    kept = np.empty((observations, *kind.shape(points, pixels)), kind.kept)
+    rows = kind.chunk(observations, points, pixels)[0]
+    for number, path in enumerate(kind.chunk_files(observations, points, pixels)):
         part = kept[number * rows : (number + 1) * rows]
         unpacked = np.frombuffer(_decode_chunk(files[path], size, f"{source}/{path}"), kind.kept)
         part[:] = unpacked[: part.size].reshape(part.shape)
@@ -246,7 +314,7 @@ def _decode_chunk(data: bytes, size: int, where: str) -> bytes:
     return unpacked
 
 
-def _check_metadata(data: bytes, kind: ArrayKind, observations: int, points: int, where: str) -> None:
+def _check_metadata(data: bytes, kind: ArrayKind, observations: int, points: int, pixels: int, where: str) -> None:
     """Hold an array's metadata, which others read it by, to what the manifest implies."""
     metadata = parse_object(data, f"{where}/{_GROUP_FILE}")
     codecs, grid = metadata.get("codecs"), metadata.get("chunk_grid")
@@ -261,9 +329,9 @@ def _check_metadata(data: bytes, kind: ArrayKind, observations: int, points: int
     }
     implied = {
         "node_type": "array",
-        "shape": [observations, *kind.shape(points)],
+        "shape": [observations, *kind.shape(points, pixels)],
         "data_type": np.dtype(kind.kept).name,
-        "chunk_grid": {"chunk_shape": list(kind.chunk(observations, points))},
+        "chunk_grid": {"chunk_shape": list(kind.chunk(observations, points, pixels))},
         "chunk_key_encoding": _CHUNK_KEYS,
         "codecs": ["bytes", "blosc"],
         "storage_transformers": [],

@@ -12,7 +12,7 @@ from shared.plan import Job
 from shared.store import reader
 from shared.store.codecs.tables import joined
 from shared.store.coverage import Window, order, overlapping, parts_of
-from shared.store.layout import MAX_ALL_POINTS, MAX_ROWS, SHARDS_FOLDER, ShardManifest
+from shared.store.layout import MAX_ALL_PIXELS, MAX_ALL_POINTS, MAX_ROWS, SHARDS_FOLDER, ShardManifest
 from shared.store.maintenance.repair import set_aside
 from shared.store.presence import alone
 from shared.store.store import Store
@@ -101,7 +101,9 @@ def _fits(group: Sequence[ShardManifest], most: int) -> bool:
     return (
         (last.plan_key, last.stop, last.points, last.more) == (new.plan_key, new.start, new.points, new.more)
         and new.stop - group[0].start <= most
+        and (not last.observations or not new.observations or last.depth_size == new.depth_size)
         and clouds * new.points <= MAX_ALL_POINTS
+        and clouds * max(manifest.depth_size for manifest in group) ** 2 <= MAX_ALL_PIXELS
         and max(clouds, sum(manifest.interactions for manifest in group)) <= MAX_ROWS
     )
 

@@ -11,6 +11,11 @@ from shared.io.text import markdown
 from shared.store.store import Store
 from shared.types import OutcomeKind
 
+DEPTH_LINES = (
+    "- `depth` there: packed depth images. With x a number of an image, s is x / 2 where x is even, else -(x + 1) / 2.",
+    "  Sums of s along rows, then along columns, modulo 65,536, are steps of 0.25 mm along the camera's forward axis;",
+    "  32,768 is the depth of the world's origin, and 0 no surface. `focal`: pixels.",
+)
 SPLIT_COLUMNS = ("split", "objects", "rollouts", "clouds", "interactions", "success rate")
 
 
@@ -78,6 +83,7 @@ def data_card(store: Store, splits: dict[str, SplitFigures]) -> str:
         "- `<split>/interactions.parquet`: one row an interaction; every column is described in the file's schema.",
         "  `observation` counts the clouds of the same split.",
         "- `<split>/observations.zarr`: points (world), normals (times 127), part ids, movable mask, pixels, camera.",
+        *(DEPTH_LINES if setting.collection.camera.keep_depth else ()),
         "- `setting.json`: camera, fidelity, ranges of hidden dynamics, objects with the hashes of their files.",
         "- The columns of hidden dynamics and `joint_twist` are what a method must infer: no input at test time.",
         "",

@@ -25,7 +25,7 @@ from shared.errors import StoreError, UsageError
 from shared.io.files import remove_tree, temporary_name
 from shared.seeds import generator
 from shared.store.codecs.columns import INTERACTION_COLUMNS, interaction_columns
-from shared.store.codecs.observations import ARRAYS, ObservationArrays
+from shared.store.codecs.observations import ArrayKind, ObservationArrays, kinds
 from shared.store.codecs.tables import joined, schema_of, unknown_columns
 from shared.store.coverage import ROLLOUT_COLUMN
 from shared.store.layout import INTERACTIONS_FILE, MAX_ROWS
@@ -142,18 +142,20 @@ class _SplitWriter:
         self._schema = pa.schema([*schema_of(columns), *unknown])
         self._rows = pq.ParquetWriter(folder / "interactions.parquet", self._schema, compression="zstd")
         self._clouds = zarr.create_group(folder / "observations.zarr", zarr_format=3)
-        points = store.setting.collection.camera.points
-        for kind in ARRAYS:
+        camera = store.setting.collection.camera
+        sizes = (camera.points, camera.image_size if camera.keep_depth else 0)
+        self._kinds: tuple[ArrayKind, ...] = kinds(sizes[1])
+        for kind in self._kinds:
             self._clouds.create_array(
                 kind.name,
-                shape=(0, *kind.shape(points)),
+                shape=(0, *kind.shape(*sizes)),
                 dtype=kind.kept,
-                chunks=(CLOUDS_A_CHUNK, *kind.shape(points)),
+                chunks=(CLOUDS_A_CHUNK, *kind.shape(*sizes)),
                 compressors=BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"),
                 attributes={"description": kind.description},
             )
         self._tables: list[Any] = []
-        self._packed: dict[str, list[NDArray[Any]]] = {kind.name: [] for kind in ARRAYS}
+        self._packed: dict[str, list[NDArray[Any]]] = {kind.name: [] for kind in self._kinds}
         self._written = self._waiting = 0
         self._figures = SplitFigures.nothing()
 
@@ -172,7 +174,7 @@ class _SplitWriter:
         self._tables.append(rows.select(self._schema.names).cast(self._schema))
         if len(self._tables) == SHARDS_A_GROUP or sum(map(len, self._tables)) >= MAX_ROWS:
             self._write_rows()
-        for kind in ARRAYS:
+        for kind in self._kinds if len(numbers) else ():
             self._packed[kind.name].append(kind.pack(getattr(clouds, kind.name)[numbers]))
         self._waiting += len(numbers)
         if self._waiting >= CLOUDS_A_CHUNK:
@@ -199,7 +201,7 @@ class _SplitWriter:
 
     def _write_clouds(self, count: int) -> None:
         """Write the first `count` clouds that wait: whole chunks, unless it is the last time."""
-        for kind in ARRAYS if count else ():
+        for kind in self._kinds if count else ():
             array: Any = self._clouds[kind.name]
             waiting = np.concatenate(self._packed[kind.name])
             array.append(waiting[:count])

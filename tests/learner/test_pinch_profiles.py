@@ -1,0 +1,128 @@
+"""Learning with pinch profiles: rows, pools and policies are told the same of an action."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cluster.config.campaign_config import CampaignConfig
+from learner.data.augmentation import draw_flips
+from learner.data.dataset import load_dataset
+from learner.data.features import FrozenFeatures, ProposalPool
+from learner.settings import AugmentationConfig, LearnerConfig
+from learner.stages.jobs import StageJob, run_stage
+from shared.config import CameraConfig
+from shared.errors import UsageError
+from shared.networks.actions import FRAME_WIDTH
+from shared.pinch import BINS, PROFILE_WIDTH
+from shared.plan import Plan
+from shared.policies.adaptation import Adapter
+from shared.policies.policy import Policy
+from shared.policies.proposers import AipProposer, ExploitProposer
+from shared.store import Store
+from shared.types import Interaction
+from tests.support.fabricate import fabricate_setting
+from tests.support.small_networks import TINY
+from tests.support.small_policies import policy_of
+from tests.support.small_trainings import FAST, fabricated_plan, fabricated_rollouts, make_store
+
+TOLD = TINY.model_copy(update={"pinch_profile": True})
+PLAN = Plan(setting=fabricate_setting(objects=4, points=64, keep_depth=True))
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return make_store(tmp_path_factory.mktemp("pinch") / "store", fabricated_rollouts(PLAN), PLAN)
+
+
+def test_rows_are_told_what_a_policy_is_told(store: Store) -> None:
+    dataset, adapter = load_dataset(store, TOLD), Adapter(policy_of(TOLD))
+    assert dataset.rows.frame.shape[1] == FRAME_WIDTH + PROFILE_WIDTH
+    there = dataset.rows.frame[:, FRAME_WIDTH + BINS : FRAME_WIDTH + 2 * BINS]
+    assert 0 < there.mean() < 1
+    for record, rows in zip(store.read_rollouts(store.jobs()[0].shard_id), dataset.rollouts, strict=True):
+        for interaction, row in zip(record.interactions, rows.tolist(), strict=True):
+            frames = adapter.frames(record.observations[interaction.observation], [interaction.action])
+            torch.testing.assert_close(frames[0], dataset.rows.frame[row], atol=1e-4, rtol=0)
+
+
+def test_proposals_at_a_pool_are_told_what_a_policy_is_told(store: Store) -> None:
+    dataset, policy = load_dataset(store, TOLD), policy_of(TOLD)
+    pool = ProposalPool.of(policy.prior, FrozenFeatures.with_pool(dataset, np.random.default_rng(0)))
+    cloud, slot = torch.tensor([0, 5]), torch.tensor([2, 3])
+    frames = pool.draw(cloud, slot, 7, np.random.default_rng(1))
+    assert frames.shape == (2, 7, FRAME_WIDTH + PROFILE_WIDTH)
+    observation, adapter = store.read_observations(store.jobs()[0].shard_id).observation(5), Adapter(policy)
+    index = np.full(7, int(pool.point[5, 3]))
+    told = adapter._told(observation, index, frames[1, :, :FRAME_WIDTH])
+    torch.testing.assert_close(told, frames[1], atol=1e-4, rtol=0)
+
+
+def test_without_the_setting_nothing_is_read_or_told(store: Store) -> None:
+    dataset = load_dataset(store, TINY)
+    assert dataset.dense is None
+    assert dataset.rows.frame.shape[1] == FRAME_WIDTH
+
+
+def test_a_store_without_depth_images_is_refused(tmp_path: Path) -> None:
+    without = make_store(tmp_path / "store", plan=fabricated_plan())
+    with pytest.raises(UsageError, match=r"keeps no depth images.*--collection\.camera\.keep-depth"):
+        load_dataset(without, TOLD)
+
+
+def test_all_stages_learn_with_profiles_and_the_policy_proposes(store: Store, tmp_path: Path) -> None:
+    augmentation = AugmentationConfig(flip=True)
+    config = LearnerConfig.model_validate(
+        FAST.model_dump()
+        | {
+            "network": TOLD.model_copy(update={"roll_symmetry": True}).model_dump(),
+            "prior": FAST.prior.model_dump() | {"augmentation": augmentation.model_dump()},
+            "aap": FAST.aap.model_dump() | {"augmentation": augmentation.model_dump()},
+        }
+    )
+    policy, source = None, None
+    for stage in ("prior", "aap", "aip"):
+        policy = run_stage(StageJob(stage=stage, store=store.path, out=tmp_path / stage, init=source), config)
+        source = tmp_path / stage
+    assert policy is not None
+    again = Policy.from_files(policy.to_files())
+    assert again.config == config.network
+    record = store.read_rollouts(store.jobs()[0].shard_id)[0]
+    seen = record.observations[0]
+    history = [Interaction(seen, one.action, one.outcome) for one in record.interactions[:2]]
+    for proposer in (
+        AipProposer(Adapter(again), np.random.default_rng(0), budget=4, threshold=-1.0),
+        ExploitProposer(Adapter(again), np.random.default_rng(0)),
+        ExploitProposer(Adapter(again), np.random.default_rng(0), "where2act"),
+    ):
+        action = proposer.propose(seen, history)
+        assert action is not None
+        np.testing.assert_allclose(action.rotation.T @ action.rotation, np.eye(3), atol=1e-9)
+    with pytest.raises(UsageError, match="keeps no depth image"):
+        Adapter(again).frames(dataclasses.replace(seen, dense=None), [record.interactions[0].action])
+
+
+def test_a_policy_is_not_used_where_no_depth_image_is_kept() -> None:
+    policy_of(TINY).check_camera(CameraConfig())
+    policy_of(TOLD).check_camera(CameraConfig(keep_depth=True))
+    with pytest.raises(UsageError, match=r"set collection\.camera\.keep_depth"):
+        policy_of(TOLD).check_camera(CameraConfig())
+
+
+def test_a_campaign_keeps_the_depth_images_that_it_learns_from() -> None:
+    learner = {"network": {"pinch_profile": True}}
+    with pytest.raises(ValueError, match=r"pinch_profile needs collection\.camera\.keep_depth"):
+        CampaignConfig.model_validate({"learner": learner})
+    kept = {"camera": {"keep_depth": True}}
+    assert CampaignConfig.model_validate({"learner": learner, "collection": kept}).learner.network.pinch_profile
+
+
+def test_flips_are_drawn_only_where_they_are_asked_for() -> None:
+    rng = np.random.default_rng(0)
+    before = rng.bit_generator.state
+    assert not draw_flips(50, AugmentationConfig(), rng).any()
+    assert rng.bit_generator.state == before
+    assert 10 < int(draw_flips(50, AugmentationConfig(flip=True), rng).sum()) < 40
+    assert "flip" not in AugmentationConfig().as_document()
