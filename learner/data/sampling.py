@@ -107,6 +107,7 @@ class Batch:
         frame: approach and forward, [B, n, 6].
         motion: m, [B, n].
         success: r as 0 or 1, [B, n].
+        details: of the outcomes, [B, n, DETAIL_WIDTH].
         facts: [B, n, facts].
     """
 
@@ -117,6 +118,7 @@ class Batch:
     frame: Tensor
     motion: Tensor
     success: Tensor
+    details: Tensor
     facts: Tensor
 
     @classmethod
@@ -131,7 +133,8 @@ class Batch:
             clouds = replace(clouds, points=turn_vectors(turns[owner], clouds.points))
             xyz, frame, facts = turn_vectors(turns, xyz), turn_vectors(turns, frame), turn_facts(turns, facts)
         point, motion, success = rows.point[index], rows.motion[index], rows.success[index]
-        return cls(clouds, ordered.cloud, point, xyz, frame, motion, success, facts)
+        details = rows.details[index]
+        return cls(clouds, ordered.cloud, point, xyz, frame, motion, success, details, facts)
 
     def features(self, encoder: PointNet2) -> Tensor:
         """What is known of the rows' points, [B, n, point_width]; each cloud is encoded once."""
