@@ -141,13 +141,9 @@ def calibrate(
         policy: is changed.
         asked: what its critics make of the interactions (see `critic_rows`).
         fit: what is fitted.
-
-    Raises:
-        UsageError: there are too few objects, successes or failures.
     """
     found = {}
     for name, rows in asked.items():
-        check(rows.labels, rows.objects)
         network = policy.prior if name == "where2act" else policy.aap
         after = held_out(rows, fit)
         strength = chosen_strength(rows, fit)
@@ -170,7 +166,11 @@ def calibrate(
 
 
 def check(labels: NDArray[np.bool_], objects: NDArray[np.str_]) -> None:
-    """Refuse interactions that are too few to calibrate on, [Q] each.
+    """Refuse interactions that are too few to calibrate on.
+
+    Args:
+        labels: whether each succeeded.
+        objects: whose it was.
 
     Raises:
         UsageError: with what there is, and what is needed.

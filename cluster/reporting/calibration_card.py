@@ -4,21 +4,22 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
-from adaafford.pretrained import PRETRAINED_FOLDER, pretrained_names
+import numpy as np
+
 from cluster.reporting.model_card import CARD_FILE, MAX_TABLE_BYTES, head
+from cluster.runs.warm_start import folder_of
 from learner.calibration import (
     CalibratedCritic,
     Calibration,
-    CriticRows,
     Fit,
     calibrate,
+    check,
     critic_rows,
     together,
 )
-from learner.data.dataset import load_dataset
+from learner.data.dataset import Dataset, load_dataset
 from learner.stages.jobs import DONE_FILE
 from shared.errors import UsageError
 from shared.formatting import finite, markdown_table, number
@@ -84,9 +85,9 @@ def calibrated(
     for store in stores:
         if store.setting.task != policy.task:
             raise UsageError(f"{store.where}: is of '{store.setting.task}', the policy for '{policy.task}'")
-    parts: list[Mapping[CalibratedCritic, CriticRows]] = []
+    data: list[tuple[Dataset, list[int]]] = []
     objects: dict[str, ObjectRef] = {}
-    interactions = successes = left_out = 0
+    labels, owners, left_out = [np.zeros(0, np.bool_)], [np.zeros(0, np.str_)], 0
     for store in stores:
         refs = {ref.id: ref for ref in store.setting.objects}
         dataset = load_dataset(store, policy.config)
@@ -94,15 +95,17 @@ def calibrated(
         dataset = replace(dataset, objects=tuple(refs[name].content_hash for name in dataset.objects))
         rollouts = [n for n, name in enumerate(dataset.objects) if name not in seen]
         left_out += len(dataset.objects) - len(rollouts)
-        if not rollouts:
-            continue
+        data.append((dataset, rollouts))
         hashes = {dataset.objects[n] for n in rollouts}
         objects |= {ref.content_hash: ref for ref in refs.values() if ref.content_hash in hashes}
-        interactions += sum(len(dataset.rollouts[n]) for n in rollouts)
-        successes += sum(int(dataset.rows.success[dataset.rollouts[n]].sum()) for n in rollouts)
-        parts.append(critic_rows(policy, dataset, rollouts, seed))
-    if not parts:
+        for n in rollouts:
+            labels.append(dataset.rows.success[dataset.rollouts[n]].numpy() > 0.5)
+            owners.append(np.full(len(labels[-1]), dataset.objects[n]))
+    if not objects:
         raise UsageError(f"the policy has seen all objects of {stores[0].where}; collect on others to calibrate it")
+    succeeded = np.concatenate(labels)
+    check(succeeded, np.concatenate(owners))
+    parts = [critic_rows(policy, dataset, rollouts, seed) for dataset, rollouts in data if rollouts]
     asked = {name: together([part[name] for part in parts]) for name in CRITICS}
     found = calibrate(policy, asked, fit)
     return CalibratedPolicy(
@@ -115,8 +118,8 @@ def calibrated(
         seen=seen | objects.keys(),
         source_says=bool(seen),
         digests=tuple(store.digest() for store in stores),
-        interactions=interactions,
-        successes=successes,
+        interactions=len(succeeded),
+        successes=int(succeeded.sum()),
     )
 
 
@@ -183,8 +186,7 @@ is the entropy of the base rate of these interactions. In brackets: 95% bootstra
 
 
 def _card_before(source: str) -> str:
-    place = PRETRAINED_FOLDER / source if source in pretrained_names() else Path(source)
-    card = (place if place.is_dir() else place.parent) / CARD_FILE
+    card = folder_of(source) / CARD_FILE
     if not card.is_file():
         return "## Before the calibration\n\nThe policy had no card."
     lines = read_bounded(card, MAX_TABLE_BYTES).decode(errors="replace").splitlines()

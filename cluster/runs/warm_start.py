@@ -45,6 +45,12 @@ def fit_to_start_from(source: str, task: str) -> Policy:
     return policy
 
 
+def folder_of(source: str) -> Path:
+    """Where a policy lies that is named as `load_policy` takes it."""
+    place = (PRETRAINED_FOLDER / source if source in pretrained_names() else Path(source)).resolve()
+    return place.parent if place.is_file() else place
+
+
 def seen_by(source: str) -> frozenset[str]:
     """Content hashes of the objects that a policy learned from or was judged by, as far as its place says.
 
@@ -52,8 +58,7 @@ def seen_by(source: str) -> frozenset[str]:
         source: as `load_policy` takes it. A run and all that lies in it, what a training stage left, what
             `export-policy` wrote and what comes along say so; a lone copy of two files does not.
     """
-    place = PRETRAINED_FOLDER / source if source in pretrained_names() else Path(source).resolve()
-    folder = place.parent if place.is_file() else place
+    folder = folder_of(source)
     known = objects_seen(folder)
     for run in map(RunFolder, (folder, *folder.parents[:_DEPTH_IN_RUN])):
         if run.objects_file.is_file():

@@ -29,7 +29,7 @@ from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.store.store import Store
 from shared.types import Float
 from tests.support.small_policies import policy_of
-from tests.support.small_trainings import make_store
+from tests.support.small_trainings import fabricated_plan, fabricated_rollouts, make_store
 
 WEIGHTS = np.array([1.0, -2.0, 0.5, 0.3])
 
@@ -158,6 +158,7 @@ def test_the_command_writes_a_policy_with_a_card(
     assert "96 interactions" in card
     assert "with 4 objects" in card
     assert objects_seen(out) == {ref.content_hash for ref in store.setting.objects}
+    assert "had no card" in card
     # What it was fitted to is no test of it any more.
     assert run(["calibrate", "--policy", str(out), *line[3:5], "--out", str(tmp_path / "again")]) == 2
     assert "the policy has seen all objects" in capsys.readouterr().err
@@ -168,6 +169,7 @@ def test_what_cannot_be_calibrated_is_refused_in_one_line(
 ) -> None:
     where = ["--store", str(store.where), "--out", str(tmp_path / "out")]
     own = ["--policy", str(policy_folder)]
+    few = make_store(tmp_path / "few", fabricated_rollouts(fabricated_plan(), 2))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     (tmp_path / "lone").mkdir()
@@ -178,6 +180,8 @@ def test_what_cannot_be_calibrated_is_refused_in_one_line(
         ([*own, "--store", str(tmp_path / "gone"), *where[2:]], "gone"),
         ([*own, *where[:2], "--out", str(tmp_path / "full")], "holds something that is no exported policy"),
         (["--policy", str(tmp_path / "lone"), *where], "prior is not trained"),
+        ([*own, "--store", str(few.where), *where[2:]], "failures on 2 objects are too few to calibrate on"),
+        ([*own, *where[:2], "--out", str(policy_folder)], "name another folder, so that it is kept"),
         ([*own, *where, "--seed", "-1"], "--seed -1"),
     ):
         assert run(["calibrate", *given]) == 2, given

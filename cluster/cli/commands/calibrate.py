@@ -45,10 +45,12 @@ def main(args: list[str]) -> int:
     from adaafford.pretrained import load_policy
     from cluster.reporting.calibration_card import as_json, as_markdown, calibrated, calibrated_files
     from cluster.reporting.model_card import check_export_folder, write_export
-    from cluster.runs.warm_start import seen_by, unknown
+    from cluster.runs.warm_start import folder_of, seen_by, unknown
     from shared.store import Store
 
     check_export_folder(command.out)
+    if command.out.resolve() == folder_of(command.policy):
+        raise UsageError(f"{command.out}: holds the policy that is calibrated; name another folder, so that it is kept")
     policy = load_policy(command.policy)
     policy.require("prior", "aap")
     stores = [Store.open(place) for place in command.store]
