@@ -14,6 +14,7 @@ interaction without an outcome is a proposal that nobody has tried yet.
 """
 
 import json
+import math
 import os
 import unicodedata
 from collections.abc import Callable
@@ -28,7 +29,7 @@ from shared.config import StrictModel
 from shared.errors import UsageError
 from shared.io.documents import named_twice
 from shared.io.files import read_bounded, write_atomically
-from shared.types import Action, Interaction, Observation, Outcome, OutcomeKind
+from shared.types import MAX_GRASP_WIDTH, Action, Interaction, Observation, Outcome, OutcomeKind
 
 MAX_HISTORY_BYTES = 1 << 20
 MAX_TRIES = 64
@@ -65,14 +66,18 @@ class TriedOutcome(StrictModel):
     """How far the part moved: rad if it turns, m if it slides; 0 for nothing, or for a grasp that slipped."""
     success: bool | None = None
     """Whether it moved as intended (a pull pulled); where nothing is said, whether it moved by more than 0.01."""
-    kind: OutcomeKind = OutcomeKind.OK
-    """How the try ended; of what a simulator tells, a robot may know "no-contact" or "no-grasp"."""
+    kind: OutcomeKind = OutcomeKind.UNKNOWN
+    """How the try ended; of what a simulator tells, a robot may know "ok", "no-contact" or "no-grasp"."""
+    grasp_width: float | None = Field(None, ge=0, le=MAX_GRASP_WIDTH)
+    """How far the fingers stayed open together when they had closed, m; None: not measured, or nothing closed."""
 
     @property
     def outcome(self) -> Outcome:
         """As policies are told it."""
-        moved = self.kind is OutcomeKind.OK and self.motion > SUCCESS_MOTION
-        return Outcome(self.kind, self.motion, moved if self.success is None else self.success)
+        moved = self.kind in (OutcomeKind.OK, OutcomeKind.UNKNOWN) and self.motion > SUCCESS_MOTION
+        success = moved if self.success is None else self.success
+        width = math.nan if self.grasp_width is None else self.grasp_width
+        return Outcome(self.kind, self.motion, success, grasp_opening=width)
 
 
 class TriedInteraction(StrictModel):

@@ -101,6 +101,9 @@ class AapConfig(TrainingConfig):
     continued_first: float = Field(0.5, ge=0, le=1)
     """How often the tries that continued one another come first in the context, where a rollout has some: what a policy
     proposed, and random ones by `rollout.continued`."""
+    unknown_details: float = Field(0.25, ge=0, le=1)
+    """How often the kinds of a rollout's outcomes, and how often its grasp widths, are left out in training, so that
+    histories without them serve as well; only where `network.outcome_details` is set."""
     top: int = Field(5, ge=1)
     """Best proposals whose mean score is a point's actionability, as published."""
     affordance: AffordanceConfig = AffordanceConfig()

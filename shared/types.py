@@ -27,6 +27,9 @@ from shared.hidden import ALWAYS_DRAWN
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
+MAX_GRASP_WIDTH = 0.5
+"""Metres; no hand opens further."""
+
 
 class OutcomeKind(StrEnum):
     """How a trial ended. Every kind but `ABANDONED` is an outcome of physics and so a label."""
@@ -45,6 +48,8 @@ class OutcomeKind(StrEnum):
     """Under the first-contact rule: the palm touched anything before or at the first contact."""
     UNSTABLE = "unstable"
     """The simulation diverged (not a number, or a joint far outside its limits)."""
+    UNKNOWN = "unknown"
+    """Nobody said how it ended, as a robot's history may leave it; no simulator gives this."""
     ABANDONED = "abandoned"
     """Infrastructure failed (a crash, a hang); says nothing of the action and is never a label."""
 
@@ -196,7 +201,7 @@ class Outcome:
     displacement: Float = field(default_factory=lambda: np.full(3, np.nan))
     """[3], world frame, of the touched point of the target part."""
     grasp_opening: float = float("nan")
-    """How far both fingers together stayed open, of primitives that close them."""
+    """How far both fingers together stayed open when they had closed, m, of primitives that close them; else NaN."""
     steps: int = 0
     """Physics steps simulated."""
 

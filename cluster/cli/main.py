@@ -37,6 +37,7 @@ COMMANDS = {
     "report": "print a run's results again, and draw its page anew",
     "adapt": "propose the next try on a scanned object, and say where it can be moved",
     "export-policy": "a run's policy in half precision with its model card, to take elsewhere",
+    "calibrate": "fit a policy's probabilities to few interactions with your own objects",
     "collect": "collect interactions into a store, without any learning",
     "train": "prior, aap, aip or alternate: train from a store alone",
     "curve": "how much trainings find out from stored tries, between Where2Act and an oracle",

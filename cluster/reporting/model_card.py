@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from learner.alternation import trained_in
 from learner.stages.jobs import DONE_FILE, objects_seen, read_policy_folder
 from shared.config import CameraConfig
 from shared.errors import UsageError
-from shared.io.files import read_bounded
+from shared.io.files import make_folder, read_bounded, write_atomically
 from shared.io.text import markdown
 from shared.plan import ObjectRef
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
@@ -116,7 +117,7 @@ def export(source: Source, licence: str) -> dict[str, bytes]:
     files = policy.to_files(half=True)
     camera = source.store.setting.collection.camera
     card = (
-        _head(policy, files, licence),
+        head(policy, files, licence),
         _data(source),
         f"## Results\n\n{source.results}",
         _limits(camera),
@@ -131,7 +132,27 @@ def _without_title(table: Path) -> str:
     return "\n".join(read_bounded(table, MAX_TABLE_BYTES).decode(errors="replace").splitlines()[1:]).strip()
 
 
-def _head(policy: Policy, files: dict[str, bytes], licence: str) -> str:
+def check_export_folder(out: Path) -> None:
+    """Refuse a folder that holds anything but an exported policy.
+
+    Raises:
+        UsageError: it does, or is no folder.
+    """
+    known = {WEIGHTS_FILE, POLICY_FILE, CARD_FILE, DONE_FILE}
+    if out.exists() and (not out.is_dir() or any(path.name not in known for path in out.iterdir())):
+        raise UsageError(f"{out}: holds something that is no exported policy; name a new or an empty folder")
+
+
+def write_export(out: Path, files: Mapping[str, bytes]) -> None:
+    """Write the files of an exported policy; raises as `check_export_folder` does, or UsageError without a folder."""
+    check_export_folder(out)
+    make_folder(out)
+    for name, data in files.items():
+        write_atomically(out / name, data)
+
+
+def head(policy: Policy, files: dict[str, bytes], licence: str) -> str:
+    """The title of a card and what the policy's files are."""
     parameters = sum(tensor.numel() for tensor in policy.modules().parameters())
     return f"""# AdaAfford policy: {policy.task}
 

@@ -47,7 +47,7 @@ def fit_to_start_from(source: str, task: str) -> Policy:
 
 def folder_of(source: str) -> Path:
     """The folder that a policy's source names, as `load_policy` takes it."""
-    place = PRETRAINED_FOLDER / source if source in pretrained_names() else Path(source).resolve()
+    place = (PRETRAINED_FOLDER / source if source in pretrained_names() else Path(source)).resolve()
     return place.parent if place.is_file() else place
 
 

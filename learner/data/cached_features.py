@@ -57,7 +57,8 @@ class FrozenAap:
         """Ask it about everything."""
         aap.eval().requires_grad_(False)
         rows, features = known.dataset.rows, known.rows(aap.encoder)
-        codes, weights = aap.interaction_codes(features, rows.xyz, rows.frame, rows.motion, rows.success)
+        tries = (features, rows.xyz, rows.frame, rows.motion, rows.success, rows.details)
+        codes, weights = aap.interaction_codes(*tries)
         return cls(aap, features, known.pool(aap.encoder), codes, weights)
 
     def latents(self, tries: Tensor) -> Tensor:

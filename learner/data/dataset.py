@@ -22,7 +22,7 @@ from shared.config import DynamicsRanges
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
 from shared.io.files import read_named
-from shared.networks.actions import middle_of
+from shared.networks.actions import middle_of, outcome_details
 from shared.networks.grouping import group_cloud
 from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import CloudBatch
@@ -38,6 +38,7 @@ COLUMNS = (
     *("plan_key", "rollout", "object_id", "step"),
     *("point_index", "rotation", "order", "role", "policy_version", "method", "budget", "target_part"),
     *("joint_positions", "joint_limits", "joint_twist", "outcome", "motion", "success"),
+    "grasp_opening",
 )
 MAX_LIST_BYTES = 1 << 20
 VALIDATION_SHARE = 5
@@ -55,6 +56,7 @@ class Rows:
         frame: approach and forward, and the pinch profile where networks are told it, [I, 6 or more].
         motion: m, [I].
         success: r as 0 or 1, [I].
+        details: kinds and grasp widths of the outcomes, [I, DETAIL_WIDTH] (see `shared.networks.actions`).
         step: [I], number within the rollout.
         continued: [I], whether the row began where the one before it left the object.
         facts: [I, facts], for the oracle only (see `learner.data.privileged`).
@@ -69,6 +71,7 @@ class Rows:
     frame: Tensor
     motion: Tensor
     success: Tensor
+    details: Tensor
     step: Tensor
     continued: Tensor
     facts: Tensor
@@ -362,6 +365,7 @@ def _rows(
         frame=torch.from_numpy(frame.astype(np.float32)),
         motion=torch.from_numpy(cells["motion"].astype(np.float32)),
         success=torch.from_numpy(cells["success"].astype(np.float32)),
+        details=torch.from_numpy(outcome_details(cells["outcome"], cells["grasp_opening"])),
         step=torch.from_numpy(cells["step"].astype(np.int64)),
         continued=torch.from_numpy(cells["order"] == Order.CONTINUE.value),
         facts=torch.from_numpy(facts),

@@ -107,6 +107,7 @@ class Batch:
         frame: approach and forward, and the pinch profile where networks are told it, [B, n, 6 or more].
         motion: m, [B, n].
         success: r as 0 or 1, [B, n].
+        details: of the outcomes, [B, n, DETAIL_WIDTH].
         facts: [B, n, facts].
     """
 
@@ -117,6 +118,7 @@ class Batch:
     frame: Tensor
     motion: Tensor
     success: Tensor
+    details: Tensor
     facts: Tensor
 
     @classmethod
@@ -142,7 +144,8 @@ class Batch:
         if flips is not None:
             frame = flip_frames(flips, frame)
         point, motion, success = rows.point[index], rows.motion[index], rows.success[index]
-        return cls(clouds, ordered.cloud, point, xyz, frame, motion, success, facts)
+        details = rows.details[index]
+        return cls(clouds, ordered.cloud, point, xyz, frame, motion, success, details, facts)
 
     def features(self, encoder: PointNet2) -> Tensor:
         """What is known of the rows' points, [B, n, point_width]; each cloud is encoded once."""

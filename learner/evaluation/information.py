@@ -45,7 +45,10 @@ def _choose(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, most: 
 
 
 def _imagined(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, success: bool) -> tuple[Tensor, Tensor]:
-    """Codes and weights of the candidates had they succeeded, or failed, each with the usual motion of such a try."""
+    """Codes and weights of the candidates had they succeeded, or failed, each with the usual motion of such a try.
+
+    What else an outcome tells (see `shared.networks.actions.outcome_details`) is unknown.
+    """
     rows = known.dataset.rows
     alike = rows.motion[(rows.success > 0) == success]
     motion = alike.median() if len(alike) else rows.motion.new_tensor(0.0)

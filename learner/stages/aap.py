@@ -4,7 +4,7 @@ Shapes: I interactions, B rollouts, n rows of each, K the longest context.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult
 from learner.training.losses import action_scoring_loss, distillation_loss
 from shared.networks.aap import Aap
+from shared.networks.actions import without_details
 from shared.networks.pointnet2 import PointNet2
 
 VALIDATION_ROLLOUTS = 32
@@ -45,6 +46,7 @@ class SeenRows:
         frame: approach and forward, and the pinch profile where networks are told it, [B, n, 6 or more].
         motion: m, [B, n].
         success: r as 0 or 1, [B, n].
+        details: of the outcomes, [B, n, DETAIL_WIDTH].
     """
 
     features: Tensor
@@ -52,11 +54,13 @@ class SeenRows:
     frame: Tensor
     motion: Tensor
     success: Tensor
+    details: Tensor
 
     @classmethod
     def of(cls, batch: Batch, encoder: PointNet2) -> "SeenRows":
         """With their clouds encoded anew, so that the encoder learns."""
-        return cls(batch.features(encoder), batch.xyz, batch.frame, batch.motion, batch.success)
+        features = batch.features(encoder)
+        return cls(features, batch.xyz, batch.frame, batch.motion, batch.success, batch.details)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +147,10 @@ class AapStage:
         mine = share(len(rollouts))
         total, ordered = int(ordered.valid.sum()), ordered.select(mine)
         seen = self._see(ordered, turns[mine], flips[mine])
+        if self.aap.config.outcome_details:
+            # Drawn for all rollouts of the step, so that several processes draw alike.
+            unknown = torch.as_tensor(rng.random((2, len(rollouts), 1)) < config.unknown_details)[:, mine]
+            seen = replace(seen, details=without_details(seen.details, *unknown))
         prediction = predict(self.aap, seen, context)
         asked = ordered.asked(context)
         losses = {"critic": action_scoring_loss(prediction.logits, seen.success[:, None], asked)}
@@ -187,7 +195,8 @@ class AapStage:
             return SeenRows.of(Batch.of(self.dataset, ordered, turns, flips), self.aap.encoder)
         index, rows = ordered.rows, self.dataset.rows
         frame = rows.frame[index] if flips is None else flip_frames(flips, rows.frame[index])
-        return SeenRows(self._features[index], rows.xyz[index], frame, rows.motion[index], rows.success[index])
+        told = (rows.motion, rows.success, rows.details)
+        return SeenRows(self._features[index], rows.xyz[index], frame, *(column[index] for column in told))
 
 
 class OracleStage:
@@ -238,7 +247,7 @@ class OracleStage:
 
 def predict(aap: Aap, seen: SeenRows, context: int) -> PrefixPrediction:
     """Score all rows after every prefix of the first `context` of them."""
-    tries = (seen.features, seen.xyz, seen.frame, seen.motion, seen.success)
+    tries = (seen.features, seen.xyz, seen.frame, seen.motion, seen.success, seen.details)
     latents = aap.prefix_latents(*aap.interaction_codes(*(x[:, :context] for x in tries)))
     xyz, frames = seen.xyz[:, None], seen.frame[:, None]
     return PrefixPrediction(aap.action_logits(seen.features[:, None], xyz, frames, latents[:, :, None]), latents)

@@ -112,7 +112,7 @@ class InteractionStage:
         batch = Batch.of(self.dataset, ordered, turns, flips)
         context = ordered.longest_context(TRIES)
         features = batch.features(self.network.encoder)
-        tries = (features, batch.xyz, batch.frame, batch.motion, batch.success)
+        tries = (features, batch.xyz, batch.frame, batch.motion, batch.success, batch.details)
         codes, weights = self.network.interaction_codes(*(column[:, :context] for column in tries))
         latents = self.network.prefix_latents(codes, weights)[:, -1:]
         logits = self.network.action_logits(features, batch.xyz, batch.frame, latents)

@@ -39,7 +39,13 @@ class Aap(nn.Module):
         self.affordance_head = Head((width, *place, latent), 1, config, product=config.products)
 
     def interaction_codes(
-        self, features: Tensor, points: Tensor, frames: Tensor, motions: Tensor, successes: Tensor
+        self,
+        features: Tensor,
+        points: Tensor,
+        frames: Tensor,
+        motions: Tensor,
+        successes: Tensor,
+        details: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """What each interaction tells alone: z_I and w_I (AdaAfford, Adaptive Information Encoder).
 
@@ -51,13 +57,14 @@ class Aap(nn.Module):
             frames: approach and forward, [..., 6].
             motions: m, [...].
             successes: r as 0 or 1, [...].
+            details: kinds and grasp widths of the outcomes, [..., DETAIL_WIDTH] (see `outcome_details`); None: unknown.
 
         Returns:
             Codes [..., latent_width] and attention weights [...].
         """
         actions = self.action_encoder(features, points, frames)
         features = point_features(features, self.config)
-        outcomes = self.outcome_encoder(outcome_inputs(motions, successes, self.config))
+        outcomes = self.outcome_encoder(outcome_inputs(motions, successes, self.config, details))
         weights = functional.softplus(self.attention_head(features, actions, outcomes)).squeeze(-1) + MIN_ATTENTION
         codes: Tensor = self.code_head(features, actions, outcomes)
         return codes, weights

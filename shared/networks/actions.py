@@ -4,12 +4,17 @@ A *frame* is the six numbers of a gripper's rotation: approach, then forward (Wh
 `config.pinch_profile` is set, the pinch profile of the action follows in the same tensor (see `shared.pinch`).
 """
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn import functional
 
 from shared.networks.network_config import NetworkConfig
 from shared.pinch import BINS
+from shared.types import MAX_GRASP_WIDTH, Float32, OutcomeKind
 
 FRAME_WIDTH = 6
 MOTION_SCALE = 0.01
@@ -18,6 +23,15 @@ PLACE_SCALE = 3.0
 """Places on an object, a few tenths of a unit, come to about 1."""
 MOMENT_SCALE = 10.0
 """Lever arms that decide whether a part turns, some hundredths of a unit, come to some tenths."""
+TOLD_KINDS = (
+    *(OutcomeKind.OK, OutcomeKind.NO_CONTACT, OutcomeKind.NO_GRASP, OutcomeKind.START_COLLISION),
+    *(OutcomeKind.WRONG_PART, OutcomeKind.HAND_CONTACT, OutcomeKind.UNSTABLE),
+)
+"""The kinds of outcome in the order in which networks are told them. They say whether the contact was valid, too."""
+DETAIL_WIDTH = 1 + len(TOLD_KINDS) + 2
+"""Numbers of `outcome_details`."""
+GRASP_SCALE = 20.0
+"""Widths of grasps, some centimetres, come to about 1."""
 _DEGENERATE = 1e-4
 """Length below which a direction is mostly rounding."""
 
@@ -82,20 +96,56 @@ def middle_of(points: Tensor, movable: Tensor) -> Tensor:
 
 def outcome_width(config: NetworkConfig) -> int:
     """How many numbers describe an outcome."""
-    return 3 if config.outcome_features else 1
+    return (3 if config.outcome_features else 1) + (DETAIL_WIDTH if config.outcome_details else 0)
 
 
-def outcome_inputs(motions: Tensor, successes: Tensor, config: NetworkConfig) -> Tensor:
+def outcome_details(kinds: Sequence[str], grasp_widths: ArrayLike) -> Float32:
+    """What is known of outcomes beside m and r, [I, DETAIL_WIDTH].
+
+    In this order: whether the kind is known, the kind (one of `TOLD_KINDS` is 1), whether the grasp width is known, the
+    grasp width. What is unknown is zeros.
+
+    Args:
+        kinds: values of `OutcomeKind`, [I].
+        grasp_widths: m, [I]; NaN where it is unknown, or where the primitive closes no fingers.
+    """
+    widths = np.asarray(grasp_widths, dtype=np.float64)
+    details = np.zeros((len(kinds), DETAIL_WIDTH), np.float32)
+    for number, kind in enumerate(TOLD_KINDS, start=1):
+        details[:, number] = np.asarray(kinds) == kind.value
+    details[:, 0] = details[:, 1:-2].sum(axis=1)
+    known = np.isfinite(widths)
+    details[:, -2] = known
+    details[known, -1] = GRASP_SCALE * widths[known].clip(0.0, MAX_GRASP_WIDTH)
+    return details
+
+
+def without_details(details: Tensor, no_kind: Tensor, no_width: Tensor) -> Tensor:
+    """Details of outcomes, [..., DETAIL_WIDTH], with the kind or the grasp width made unknown where said, [...]."""
+    return torch.cat(
+        [details[..., :-2] * ~no_kind[..., None], details[..., -2:] * ~no_width[..., None]],
+        dim=-1,
+    )
+
+
+def outcome_inputs(motions: Tensor, successes: Tensor, config: NetworkConfig, details: Tensor | None = None) -> Tensor:
     """The numbers that describe outcomes, [..., outcome_width].
 
     Args:
         motions: m, [...].
         successes: r as 0 or 1, [...]; used only where `config.outcome_features` is set (a deviation: the paper has m).
         config: the sizes.
+        details: see `outcome_details`, [..., DETAIL_WIDTH]; used only where `config.outcome_details` is set (a
+            deviation as well). None: all are unknown.
     """
-    if not config.outcome_features:
-        return motions[..., None]
-    return torch.stack([motions, torch.log1p(motions / MOTION_SCALE), successes], dim=-1)
+    inputs = motions[..., None]
+    if config.outcome_features:
+        inputs = torch.stack([motions, torch.log1p(motions / MOTION_SCALE), successes], dim=-1)
+    if not config.outcome_details:
+        return inputs
+    if details is None:
+        details = motions.new_zeros(*motions.shape, DETAIL_WIDTH)
+    return torch.cat([inputs, details], dim=-1)
 
 
 def orthonormal_frames(raw: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor
 from shared.errors import UsageError
 from shared.geometry import gripper_rotation, points_in_view, view_from_world
 from shared.networks.aap import Aap
-from shared.networks.actions import FRAME_WIDTH, middle_of
+from shared.networks.actions import FRAME_WIDTH, middle_of, outcome_details
 from shared.networks.grouping import group_cloud, nearest_points
 from shared.networks.pointnet2 import CloudBatch, EncodedClouds, PointNet2
 from shared.pinch import PROFILE_WIDTH, pinch_profiles
@@ -240,13 +240,14 @@ class Adapter:
                 return self._adaptive(module).encoder
 
     def _interaction_code(self, interaction: Interaction, module: ModuleName) -> tuple[Tensor, Tensor]:
-        index = np.array([interaction.action.point_index])
+        index, outcome = np.array([interaction.action.point_index]), interaction.outcome
         return self._adaptive(module).interaction_codes(
             self.features(interaction.observation, module, index),
             self.places(interaction.observation, index),
             self.frames(interaction.observation, [interaction.action]),
-            torch.tensor([interaction.outcome.motion], dtype=torch.float32),
-            torch.tensor([float(interaction.outcome.success)]),
+            torch.tensor([outcome.motion], dtype=torch.float32),
+            torch.tensor([float(outcome.success)]),
+            torch.from_numpy(outcome_details([outcome.kind], [outcome.grasp_opening])),
         )
 
 

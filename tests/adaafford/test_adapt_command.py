@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import os
 import subprocess
 import sys
@@ -145,12 +146,24 @@ def test_a_history_comes_back(tmp_path: Path) -> None:
         (TriedOutcome(motion=0.2), True),
         (TriedOutcome(motion=0.005), False),
         (TriedOutcome(motion=0.2, success=False), False),
+        (TriedOutcome(motion=0.2, kind=OutcomeKind.OK), True),
         (TriedOutcome(motion=0.2, kind=OutcomeKind.NO_GRASP), False),
+        (TriedOutcome(motion=0.0, grasp_width=0.03), False),
     ],
 )
 def test_an_outcome_succeeds_by_its_motion_unless_told(told: TriedOutcome, success: bool) -> None:
     assert told.outcome.success is success
     assert told.outcome.motion == told.motion
+    assert told.outcome.kind is told.kind
+    assert told.outcome.grasp_opening == pytest.approx(
+        float("nan") if told.grasp_width is None else told.grasp_width, nan_ok=True
+    )
+
+
+def test_an_outcome_without_details_says_that_they_are_unknown() -> None:
+    told = TriedOutcome.model_validate_json('{"motion": 0.0}').outcome
+    assert told.kind is OutcomeKind.UNKNOWN
+    assert math.isnan(told.grasp_opening)
 
 
 def entry(**changes: object) -> dict[str, object]:
@@ -501,6 +514,9 @@ def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
     for wrong, expected in (
         (["--outcome", "-1"], "--outcome: setting 'motion'"),
         (["--kind", "no-grasp"], "give --outcome MOTION"),
+        (["--grasp-width", "0.02"], "give --outcome MOTION"),
+        (["--outcome", "0", "--grasp-width", "20"], "--outcome: setting 'grasp_width'"),
+        (["--outcome", "0", "--grasp-width", "nan"], "--outcome: setting 'grasp_width'"),
         (["--out", "heat.obj"], "not a kind of heatmap"),
         (["--budget", "0"], "at least one try"),
         (["--points", "9"], "allowed are 64 to 16384"),

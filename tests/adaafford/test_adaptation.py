@@ -15,7 +15,7 @@ from shared.policies.adaptation import (
 )
 from shared.policies.policy import Policy
 from shared.policies.proposers import TOP_POINTS, AipProposer, ExploitProposer, points_of
-from shared.types import Action, Interaction, Proposer
+from shared.types import Action, Interaction, Outcome, OutcomeKind, Proposer
 from tests.support.small_networks import TINY
 from tests.support.small_policies import history_of, observation_of, policy_of
 
@@ -178,3 +178,20 @@ def test_networks_of_full_size_propose_where_something_moves() -> None:
     action = AipProposer(adapter, np.random.default_rng(0), budget=4).propose(observation, [])
     assert action is not None
     assert observation.movable[action.point_index]
+
+
+def test_what_a_failure_tells_reaches_a_policy_with_outcome_details_alone() -> None:
+    observation = observation_of()
+    (made,) = history_of(observation, 1)
+    outcomes = {
+        "held": Outcome(OutcomeKind.OK, 0.0, False, grasp_opening=0.02),
+        "slipped": Outcome(OutcomeKind.NO_GRASP, 0.0, False, grasp_opening=0.001),
+        "kind alone": Outcome(OutcomeKind.OK, 0.0, False),
+        "nothing": Outcome(OutcomeKind.UNKNOWN, 0.0, False),
+    }
+    for detailed, different in ((True, len(outcomes)), (False, 1)):
+        adapter = Adapter(policy_of(TINY.model_copy(update={"outcome_details": detailed})))
+        found = [adapter.z([dataclasses.replace(made, outcome=outcome)]) for outcome in outcomes.values()]
+        assert len({z.numpy().tobytes() for z in found}) == different
+        heat = adapter.affordance(observation, [dataclasses.replace(made, outcome=outcomes["nothing"])])
+        assert np.isfinite(heat).all()

@@ -29,6 +29,7 @@ SPEAKING = {
     "report": ["report", "--help"],
     "adapt": ["adapt", "--help"],
     "export-policy": ["export-policy", "RUN", "--out", "EXPORTED"],
+    "calibrate": ["calibrate", "--help"],
     "collect": ["collect", "--help"],
     "train": ["train", "--help"],
     "curve": ["curve", "--help"],

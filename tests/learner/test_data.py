@@ -27,7 +27,7 @@ from shared.config import DynamicsRanges
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
 from shared.hidden import ALWAYS_DRAWN
-from shared.networks.actions import middle_of, orthonormal_frames
+from shared.networks.actions import GRASP_SCALE, middle_of, orthonormal_frames, outcome_details
 from shared.records import RolloutRecord
 from shared.store.store import Store
 from shared.types import OutcomeKind
@@ -61,6 +61,17 @@ def test_every_cloud_is_there_once_and_every_row_in_the_view_frame(
             expected = np.concatenate([view @ interaction.action.approach, view @ interaction.action.forward])
             np.testing.assert_allclose(dataset.rows.frame[row], expected, atol=1e-6)
             assert bool(dataset.rows.success[row]) == interaction.outcome.success
+
+
+def test_rows_have_the_kind_and_the_grasp_width_of_their_outcome(tmp_path: Path, records: list[RolloutRecord]) -> None:
+    first, second, *others = records[0].interactions
+    held = dataclasses.replace(first, outcome=dataclasses.replace(first.outcome, grasp_opening=0.03))
+    changed = [dataclasses.replace(records[0], interactions=(held, second, *others)), *records[1:]]
+    loaded = load_dataset(make_store(tmp_path / "store", changed), TINY)
+    outcomes = [interaction.outcome for record in changed for interaction in record.interactions]
+    told = outcome_details([one.kind for one in outcomes], [one.grasp_opening for one in outcomes])
+    np.testing.assert_array_equal(loaded.rows.details[torch.cat(loaded.rollouts)], told)
+    assert loaded.rows.details[loaded.rollouts[0][0], -2:].tolist() == pytest.approx([1.0, 0.03 * GRASP_SCALE])
 
 
 def test_failed_infrastructure_is_no_label(tmp_path: Path, records: list[RolloutRecord]) -> None:

@@ -39,6 +39,7 @@ from learner.stages.prior import PriorStage
 from learner.training.checkpoint import Cursor
 from learner.training.loop import Stage, StepResult, rate_factor, train
 from shared.errors import UsageError
+from shared.networks.actions import outcome_details
 from shared.networks.network_config import NetworkConfig
 from shared.policies.policy import WEIGHTS_FILE, Policy
 from shared.records import InteractionRecord, RolloutRecord
@@ -78,6 +79,21 @@ def test_aap_learns_to_read_a_try(coin_dataset: Dataset) -> None:
     assert figures["f_score_after_4"] > 0.9
     # Without a try the coin may only be guessed, unless the cloud is learnt by heart.
     assert figures["bce_after_0"] > 2 * figures["bce_after_4"]
+
+
+@pytest.mark.parametrize(("detailed", "unknown"), [(True, 0.0), (True, 1.0), (False, 0.0)])
+def test_aap_is_told_the_kind_of_an_outcome_where_it_is_not_left_out(
+    coin_dataset: Dataset, detailed: bool, unknown: float
+) -> None:
+    rows, config = coin_dataset.rows, AapConfig(context=4, batch_rollouts=8, unknown_details=unknown)
+    losses = []
+    for kind, width in (("ok", 0.03), ("no-grasp", 0.0)):
+        details = torch.from_numpy(outcome_details([kind] * len(rows), [width] * len(rows)))
+        told = dataclasses.replace(coin_dataset, rows=dataclasses.replace(rows, details=details))
+        policy, known = fresh(told, config=TINY.model_copy(update={"outcome_details": detailed}))
+        loss = AapStage(policy.aap, known, EVERYTHING, config).loss(np.random.default_rng(7)).losses["critic"]
+        losses.append(float(loss.detach()))
+    assert (losses[0] != losses[1]) is (detailed and not unknown)
 
 
 def test_the_oracle_knows_and_aap_learns_from_it(coin_dataset: Dataset) -> None:

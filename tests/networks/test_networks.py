@@ -11,12 +11,25 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from shared.networks.aap import Aap
-from shared.networks.actions import MOMENT_SCALE, action_inputs, geodesic_distance, in_gripper, orthonormal_frames
+from shared.networks.actions import (
+    DETAIL_WIDTH,
+    MOMENT_SCALE,
+    TOLD_KINDS,
+    action_inputs,
+    geodesic_distance,
+    in_gripper,
+    orthonormal_frames,
+    outcome_details,
+    outcome_inputs,
+    outcome_width,
+    without_details,
+)
 from shared.networks.grouping import Grouping, group_cloud, nearest_points
 from shared.networks.layers import Head, point_features
 from shared.networks.network_config import NETWORKS, NetworkConfig
 from shared.networks.pointnet2 import CloudBatch, PointNet2, surroundings
 from shared.networks.prior import Prior
+from shared.types import OutcomeKind
 from tests.support.small_networks import TINY
 
 
@@ -225,3 +238,39 @@ def test_clouds_do_not_keep_the_indices_that_they_are_made_of() -> None:
     stacked = np.random.default_rng(0).uniform(size=(4, 32, 3)).astype(np.float32)
     batch = CloudBatch.of(stacked, groupings())
     assert torch.equal(batch.neighbours[0][3], torch.from_numpy(group_cloud(stacked[3], TINY).neighbours[0]))
+
+
+def test_outcome_details_of_every_kind_and_width_differ_and_unknown_ones_are_zeros() -> None:
+    kinds = [*OutcomeKind, OutcomeKind.OK]
+    told = outcome_details(kinds, [float("nan")] * len(OutcomeKind) + [0.02])
+    assert told.shape == (len(kinds), DETAIL_WIDTH)
+    nothing = [row for kind, row in zip(kinds, told, strict=True) if kind not in TOLD_KINDS]
+    assert len(nothing) == 2
+    assert not np.any(nothing)
+    assert len({row.tobytes() for row in told}) == len(TOLD_KINDS) + 2
+    hostile = outcome_details(["ok", "no-such-kind"], [float("inf"), 1e300])
+    assert np.isfinite(hostile).all()
+    assert hostile[0, -2:].tolist() == [0.0, 0.0]
+
+
+def test_details_are_left_out_one_by_one() -> None:
+    whole = torch.from_numpy(outcome_details(["ok"] * 3, [0.02] * 3))
+    kept = without_details(whole, torch.tensor([False, True, True]), torch.tensor([False, False, True]))
+    assert torch.equal(kept[0], whole[0])
+    assert torch.equal(kept[1], torch.from_numpy(outcome_details(["unknown"], [0.02]))[0])
+    assert not kept[2].any()
+
+
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+def test_an_outcome_enters_with_details_only_where_the_setting_says_so(name: str) -> None:
+    told = NETWORKS[name].model_copy(update={"outcome_details": True})
+    motions = successes = torch.zeros(2)
+    held_and_slipped = torch.from_numpy(outcome_details(["ok", "no-grasp"], [0.02, 0.0]))
+    plain = outcome_inputs(motions, successes, NETWORKS[name], held_and_slipped)
+    assert torch.equal(plain, outcome_inputs(motions, successes, NETWORKS[name]))
+    assert torch.equal(plain[0], plain[1])
+    detailed = outcome_inputs(motions, successes, told, held_and_slipped)
+    assert detailed.shape == (2, outcome_width(told))
+    assert not torch.equal(detailed[0], detailed[1])
+    unknown = torch.from_numpy(outcome_details(["unknown"] * 2, [float("nan")] * 2))
+    assert torch.equal(outcome_inputs(motions, successes, told), outcome_inputs(motions, successes, told, unknown))

@@ -40,8 +40,10 @@ class AdaptCommand:
     """Where the adapted affordance goes: .ply, .npz or .html; heatmap.ply beside the history where none is given."""
     outcome: float | None = None
     """How far the part moved in what the last call proposed: rad if it turns, m if it slides, 0 for nothing."""
-    kind: OutcomeKind = OutcomeKind.OK
-    """How that try ended, such as "no-contact" or "no-grasp"."""
+    kind: OutcomeKind = OutcomeKind.UNKNOWN
+    """How that try ended, such as "ok", "no-contact" or "no-grasp"."""
+    grasp_width: float | None = None
+    """How far the fingers stayed open together when they had closed in that try, m."""
     success: bool | None = None
     """Whether it moved as intended; where nothing is said, whether it moved by more than 0.01."""
     up: tuple[float, float, float] | None = None
@@ -63,8 +65,11 @@ class AdaptCommand:
 def main(args: list[str]) -> int:
     """Adapt."""
     command = parse_flags(AdaptCommand, args, "adapt")
-    if command.outcome is None and (command.success is not None or command.kind is not OutcomeKind.OK):
-        raise UsageError("--success and --kind say how an outcome is meant; give --outcome MOTION with them")
+    details = (command.success, command.grasp_width, None if command.kind is OutcomeKind.UNKNOWN else command.kind)
+    if command.outcome is None and any(detail is not None for detail in details):
+        raise UsageError(
+            "--success, --kind and --grasp-width say how an outcome is meant; give --outcome MOTION with them"
+        )
     if command.budget < 1:
         raise UsageError(f"--budget {command.budget}: at least one try is needed to adapt")
     if not MIN_SHOWN <= command.points <= MAX_SHOWN:
@@ -79,7 +84,12 @@ def main(args: list[str]) -> int:
     files = SessionFiles(command.history, command.out or command.history.parent / "heatmap.ply")
     policy = load_policy(command.policy or only_pretrained())
     session = Session(policy, files, command.budget, command.seed, command.up, command.camera, command.points, _say)
-    told = {"motion": command.outcome, "success": command.success, "kind": command.kind}
+    told = {
+        "motion": command.outcome,
+        "success": command.success,
+        "kind": command.kind,
+        "grasp_width": command.grasp_width,
+    }
     outcome = None if command.outcome is None else parse(TriedOutcome, told, "--outcome")
     print(session.step(command.cloud, outcome).model_dump_json(), flush=True)
     if command.follow:

@@ -7,7 +7,6 @@ from typing import Annotated
 import tyro
 
 from cluster.config.flags import parse_flags
-from shared.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +32,8 @@ class ExportPolicyCommand:
 def main(args: list[str]) -> int:
     """Export."""
     command = parse_flags(ExportPolicyCommand, args, "export-policy")
-    from cluster.reporting.model_card import export, source_of_run, source_of_training
+    from cluster.reporting.model_card import export, source_of_run, source_of_training, write_export
     from cluster.runs.run_folder import find
-    from shared.io.files import write_atomically
     from shared.store import Store
 
     if command.store is None:
@@ -43,13 +41,7 @@ def main(args: list[str]) -> int:
     else:
         source = source_of_training(command.run, Store.open(command.store), command.results, command.origin)
     files = export(source, command.licence)
-    if command.out.exists() and (
-        not command.out.is_dir() or any(path.name not in files for path in command.out.iterdir())
-    ):
-        raise UsageError(f"{command.out}: holds something that is no exported policy; name a new or an empty folder")
-    command.out.mkdir(parents=True, exist_ok=True)
-    for name, data in files.items():
-        write_atomically(command.out / name, data)
+    write_export(command.out, files)
     total = sum(map(len, files.values())) / 1e6
     print(f"{command.out}: {source.name} of task {source.policy.task}, {total:.1f} MB")
     return 0
