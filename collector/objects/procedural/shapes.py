@@ -11,10 +11,8 @@ import numpy as np
 
 from collector.objects import meshes
 from collector.objects.articulation import Mesh
+from collector.objects.model import Pieces, Point
 from shared.types import Float
-
-Point = tuple[float, float, float]
-Pieces = tuple[Mesh, ...]
 
 FRONT: Point = (-1.0, 0.0, 0.0)
 BACK: Point = (1.0, 0.0, 0.0)
