@@ -34,8 +34,7 @@ def write_object(folder: Path, model: ObjectModel, meta: Mapping[str, object] | 
 
 def object_files(model: ObjectModel, meta: Mapping[str, object] | None = None) -> dict[str, str]:
     """The files of an object, by relative path."""
-    # As in PartNet-Mobility, movable links come first and the body last.
-    links = [f"link_{len(model.parts)}", *(f"link_{index}" for index in range(len(model.parts)))]
+    links = link_names(model)
     names = [model.body_name, *(part.name for part in model.parts)]
     shapes = [(model.body, model.body_collisions), *((part.pieces, part.collisions) for part in model.parts)]
     files = {}
@@ -50,6 +49,11 @@ def object_files(model: ObjectModel, meta: Mapping[str, object] | None = None) -
     files[META_FILE] = json.dumps({"model_cat": model.category, "generator": GENERATOR, **(meta or {})}) + "\n"
     files[URDF_FILE] = _urdf(model, links)
     return files
+
+
+def link_names(model: ObjectModel) -> list[str]:
+    """The links of the body and of the parts; as in PartNet-Mobility, those that move come first and the body last."""
+    return [f"link_{len(model.parts)}", *(f"link_{index}" for index in range(len(model.parts)))]
 
 
 def obj_text(mesh: Mesh) -> str:

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from collector.objects.articulation import Mesh
-from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
-from collector.objects.procedural.shapes import point
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point, point
 from shared.types import Float
 
 GRID = 2.0**-14
