@@ -20,6 +20,8 @@ from collector.objects.readers import read_object
 from collector.objects.writing import obj_text
 from shared.errors import ObjectError, UsageError
 
+EXACT = ("package://package", "model://package", "../meshes")
+"""Names that say where the mesh is; the others only say how its path ends."""
 BOX = np.array([0.2, 0.4, 0.6])
 COLLADA = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -226,7 +228,8 @@ def test_meshes_are_found_below_a_search_path_and_nowhere_else(name: str, cabine
     cabinet.write_text(urdf(name))
     with pytest.raises(ObjectError, match="--search-path"):
         imported(cabinet, tmp_path / "objects")
-    made = imported(cabinet, tmp_path / "objects", ImportSettings(search=[package]))
+    made = imported(cabinet, tmp_path / "objects", ImportSettings(search=[cabinet.parent / ".."]))
+    assert len([note for note in made.notes if "ends of their paths" in note]) == (not name.startswith(EXACT))
     assert len(made.after.parts[0].visuals) == 1
 
 

@@ -160,7 +160,7 @@ def _import(command: ImportCommand) -> int:
     placement = Placement(
         command.front or source.front, command.up, command.scale, USUAL_SIZE if command.size is None else command.size
     )
-    names = dict(_assigned(word) for word in command.part_names)
+    names = dict(_assigned(word) for given in command.part_names for word in given.split(",") if word)
     settings = ImportSettings(
         command.search_path, placement, command.category, names, command.root, command.radians, command.replace
     )

@@ -129,7 +129,7 @@ def _read(source: Source, settings: ImportSettings) -> Description:
     bodies = tuple(
         replace(body, part_name=settings.part_names.get(body.link, body.part_name)) for body in described.bodies
     )
-    return replace(described, bodies=bodies, notes=(*described.notes, *files.notes()))
+    return replace(described, bodies=bodies)
 
 
 def _write(folder: Path, model: ObjectModel, source: Source) -> ArticulatedObject:

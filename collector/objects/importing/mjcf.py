@@ -73,7 +73,7 @@ def read_mjcf(file: Path, files: SourceFiles, root: str | None = None, radians: 
     bodies, notes = _Bodies(model, found).below(root)
     if left_out := [tag for tag in SAID if tag in document.left_out]:
         notes.append(f"left out: {listed([f'<{tag}>' for tag in left_out])}")
-    return Description(UNKNOWN_CATEGORY, bodies, tuple(notes))
+    return Description(UNKNOWN_CATEGORY, bodies, (*notes, *files.notes()))
 
 
 @dataclass(slots=True)
@@ -198,7 +198,7 @@ class _Meshes:
             scale = np.array(asset.scale, dtype=np.float64)
             if np.abs(scale).min() < 1e-9:
                 raise ObjectError(f"mesh {short(asset.name)}: a scale other than 0 is needed along each axis")
-            reference = np.linalg.inv(_pose(np.array(asset.refpos), np.array(asset.refquat)))
+            reference: Float = np.linalg.inv(_pose(np.array(asset.refpos), np.array(asset.refquat)))
             found[asset.name] = meshes.placed(mesh, reference, scale)
             asset.file = ""
             asset.uservert, asset.userface = _UNIT_SIMPLEX.ravel().tolist(), _SIMPLEX_FACES
@@ -287,7 +287,7 @@ class _Bodies:
         if model.jnt_limited[j]:
             # Position 0 of ours is where the file draws the body.
             lower, upper = (float(limit) - float(model.qpos0[model.jnt_qposadr[j]]) for limit in model.jnt_range[j])
-        several = any(name == each[0] for each in bodies)
+        several = any(name == each[0] for each in bodies[1:])
         joint = Joint(
             name=model.joint(j).name or f"joint_{j}",
             kind="prismatic" if slides else "revolute",
@@ -298,7 +298,8 @@ class _Bodies:
             upper=upper,
         )
         bodies.append((f"{name}_{j}" if several else name, joint, [], []))
-        return len(bodies) - 1, np.linalg.inv(anchor)
+        anchor[:3, 3] *= -1.0
+        return len(bodies) - 1, anchor
 
     def _add_shapes(self, body: int, pose: Float, seen: list[Mesh], hit: list[Mesh]) -> None:
         model, first = self._model, self._model.body_geomadr[body]

@@ -82,4 +82,6 @@ def opening_upwards(model: ObjectModel) -> tuple[ObjectModel, list[str]]:
 
 def _vector(direction: Direction) -> Float:
     assert direction in get_args(Direction)
-    return np.eye(3)["xyz".index(direction[1])] * (1.0 if direction[0] == "+" else -1.0)
+    vector = np.zeros(3)
+    vector["xyz".index(direction[1])] = 1.0 if direction[0] == "+" else -1.0
+    return vector

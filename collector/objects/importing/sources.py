@@ -28,7 +28,7 @@ class SourceFiles:
             if not each.is_dir():
                 raise UsageError(f"--search-path {each}: no such folder; name one that holds the object's other files")
         self.folder = folder
-        self._roots = tuple(ObjectFiles(each.absolute()) for each in (folder, *search))
+        self._roots = tuple(ObjectFiles(Path(os.path.normpath(each.absolute()))) for each in (folder, *search))
         self._elsewhere: list[str] = []
 
     def find(self, name: str, most_bytes: int) -> tuple[str, bytes] | None:

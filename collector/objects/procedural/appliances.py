@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from collector.objects.model import MovablePart, ObjectModel
+from collector.objects.model import MovablePart, ObjectModel, Pieces
 from collector.objects.procedural.assembly import hinged, sliding
 from collector.objects.procedural.cabinets import GAP, knob
-from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, Pieces, block, grip, hollow_box, rod
+from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, rod
 
 BUTTON_TRAVEL = 0.03
 

@@ -2,23 +2,10 @@
 
 import numpy as np
 
-from collector.objects.model import MovablePart, ObjectModel
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
 from collector.objects.procedural.assembly import hinged, sliding
 from collector.objects.procedural.cabinets import GAP
-from collector.objects.procedural.shapes import (
-    BACK,
-    LEFT,
-    RIGHT,
-    TOP,
-    Pieces,
-    Point,
-    arch,
-    block,
-    hollow_box,
-    moved,
-    rod,
-    tub,
-)
+from collector.objects.procedural.shapes import BACK, LEFT, RIGHT, TOP, arch, block, hollow_box, moved, rod, tub
 
 
 def random_box(rng: np.random.Generator) -> ObjectModel:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from collector.objects.model import MovablePart, ObjectModel
-from collector.objects.procedural.shapes import BOTTOM, TOP, Pieces, Point, block, moved, rod
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
+from collector.objects.procedural.shapes import BOTTOM, TOP, block, moved, rod
 
 
 def random_faucet(rng: np.random.Generator) -> ObjectModel:
