@@ -130,7 +130,7 @@ def write_folder(folder: Path, files: Mapping[str, str]) -> Path:
     if folder.exists():
         if _holds(folder, files):
             return folder
-        raise UsageError(f"{folder}: holds another object; name another folder, or the seed that it was made with")
+        raise UsageError(f"{folder}: holds another object, or one of another seed or mass; name another folder")
     # Readers pass over hidden folders, so a kill leaves nothing that could be taken for an object.
     partial = folder.parent / temporary_name(folder.name)
     try:

@@ -196,6 +196,7 @@ def test_every_mesh_format_gives_the_same_mesh(ending: str, parser: MeshParser) 
         ("box.glb", glb(meshes.box(BOX), uri="../secret.bin"), "names other files"),
         ("box.glb", glb(meshes.box(BOX))[:40], "cannot be read"),
         ("box.glb", b"", "cannot be read"),
+        ("box.glb", glb(meshes.placed(meshes.box(BOX), np.eye(4), np.full(3, np.nan))), "not finite"),
         ("box.dae", b'<!DOCTYPE x [<!ENTITY a "b">]><COLLADA>&a;</COLLADA>', "cannot be read"),
         ("box.dae", b"PK\x03\x04", "cannot be read"),
         ("box.fbx", b"", "allowed: .obj"),

@@ -163,6 +163,8 @@ def test_includes_are_read_inside_the_folders_alone(room: Path) -> None:
         (mjcf().replace("panel.obj", "absent.obj"), "absent"),
         (mjcf(compiler='meshdir="/etc"').replace("panel.obj", "passwd"), "--search-path"),
         (mjcf().replace('scale="2 1 1"', 'scale="0 1 1"'), "scale"),
+        (mjcf('<body pos="1e9 0 0"><geom size="1"/></body>'), "not finite, or beyond"),
+        (mjcf('<body><geom size="nan"/></body>'), "not finite|MuJoCo refuses it"),
         ("<sdf/>", "instead of <mujoco>"),
         ('<!DOCTYPE m [<!ENTITY a "b">]><mujoco>&a;</mujoco>', "entities are refused"),
         ("<mujoco", "malformed XML"),

@@ -202,7 +202,10 @@ def _export(command: ExportCommand) -> int:
     from collector.objects.exporting import export_object
     from shared.errors import ObjectError
 
-    usable, failed = scan(command.path).usable, 0
+    catalogue = scan(command.path)
+    usable, failed = catalogue.usable, len(catalogue.refused)
+    for object_id, reason in catalogue.refused:
+        print(plain(f"{object_id}  refused: {reason}"))
     for entry in usable:
         try:
             target = load_ref(command.path, entry.ref, command.collision)
@@ -212,8 +215,9 @@ def _export(command: ExportCommand) -> int:
             print(plain(f"{entry.ref.id}  refused: {error}"))
         else:
             print(plain(f"{entry.ref.id}  {main}"))
-    print(f"{len(usable) - failed} exported, {failed} refused")
-    return 0 if failed < len(usable) else UsageError.exit_code
+    exported = len(usable) + len(catalogue.refused) - failed
+    print(f"{exported} exported, {failed} refused")
+    return 0 if exported else UsageError.exit_code
 
 
 def _check(command: CheckCommand) -> int:

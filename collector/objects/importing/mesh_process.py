@@ -41,7 +41,10 @@ def read_mesh(data: bytes, ending: str) -> Mesh:
         _check_glb(data)
     scene = trimesh.load_scene(BytesIO(data), file_type=ending[1:], process=False, skip_materials=True)
     mesh = scene.to_mesh()
-    return Mesh(np.array(mesh.vertices, dtype=np.float64) * scale, np.array(mesh.faces, dtype=np.int32))
+    vertices = np.array(mesh.vertices, dtype=np.float64) * scale
+    if not np.isfinite(vertices).all():
+        raise ValueError("a vertex is not finite")
+    return Mesh(vertices, np.array(mesh.faces, dtype=np.int32))
 
 
 def _unit(root: Element) -> float:

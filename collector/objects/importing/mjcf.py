@@ -161,6 +161,8 @@ class _Document:
 
 def _spec(top: Element) -> Any:
     """MuJoCo's own tree of a document that names no file but those of meshes, which are not read yet."""
+    # It would write what it warns of into a file in the working folder; what matters is checked here.
+    mujoco.set_mju_user_warning(lambda _: None)
     for geom in top.iter("geom"):
         for name in ("hfield", "fluidshape"):
             geom.attrib.pop(name, None)
@@ -225,6 +227,9 @@ class _Bodies:
     def __init__(self, model: Any, found: dict[str, Mesh]) -> None:
         if model.nbody > MAX_LINKS or model.ngeom > MAX_SHAPES:
             raise ObjectError(f"{model.nbody} bodies and {model.ngeom} geoms; at most {MAX_LINKS} and {MAX_SHAPES}")
+        for numbers in (model.geom_size, model.geom_pos, model.body_pos, model.jnt_pos, model.jnt_range, model.qpos0):
+            if not (np.abs(numbers) <= meshes.MAX_COORDINATE).all():
+                raise ObjectError(f"a size, a position or a limit is not finite, or beyond {meshes.MAX_COORDINATE:g}")
         self._model = model
         self._found = found
         self._free: list[str] = []
