@@ -8,8 +8,11 @@ from shared.errors import UsageError
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
     "report": ("matplotlib", "plotly", "jinja2"),
+    "import": ("trimesh", "pycollada", "mujoco"),
 }
 """Extras of pyproject.toml, and the packages that each brings."""
+MODULES = {"pycollada": "collada"}
+"""What a package is imported as, where that is not its name."""
 
 
 def require(purpose: str, *extras: str, without: tuple[str, ...] = ()) -> None:
@@ -33,7 +36,7 @@ def require_packages(purpose: str, *packages: str) -> None:
     Raises:
         UsageError: one is not.
     """
-    missing = [name for name in packages if find_spec(name) is None]
+    missing = [name for name in packages if find_spec(MODULES.get(name, name)) is None]
     if missing:
         raise UsageError(missing_line(purpose, *missing))
 
@@ -49,4 +52,4 @@ def missing_line(purpose: str, *packages: str) -> str:
 def extra_of(package: str | None) -> str | None:
     """The extra that brings a package, or a module of it; None for a package that no extra brings."""
     top = (package or "").partition(".")[0]
-    return next((extra for extra, names in EXTRAS.items() if top in names), None)
+    return next((extra for extra, names in EXTRAS.items() if top in {*names, *(MODULES.get(n) for n in names)}), None)

@@ -44,7 +44,7 @@ COMMANDS = {
     "status": "how a run or a store stands: rate, done, left, workers",
     "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
     "store": "info, verify, digest, replay, repair, compact, merge, export, migrate or check-place: look after stores",
-    "objects": "generate, check, preview or decompose: the objects",
+    "objects": "generate, import, export, check, preview, film or decompose: the objects",
     "bench": "fidelity, dynamics, collect or learner: measure what helps to choose settings",
     "version": "print the version",
 }

@@ -16,8 +16,8 @@ from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import load_ref
 from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import storage_furniture
-from collector.objects.procedural.writing import write_object
 from collector.objects.readers import read_object
+from collector.objects.writing import write_object
 from collector.random_proposer import RepeatingProposer
 from collector.recorder import interact
 from collector.sim.environment import SapienEnvironment

@@ -25,7 +25,7 @@ from shared.seeds import generator
 from shared.tasks import Task
 
 MAX_LIST_BYTES = 1 << 20
-_OBJECT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+OBJECT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ def read_list(path: Path) -> tuple[str, ...]:
         raise UsageError(f"{path}: not text; name a list of '<id> <category>' lines") from None
     ids = [line.split()[0] for line in lines if line.strip()]
     for object_id in ids:
-        if not _OBJECT_ID.fullmatch(object_id):
+        if not OBJECT_ID.fullmatch(object_id):
             raise UsageError(f"{path}: {short(object_id)} is not an object's id; a line is '<id> <category>'")
     return tuple(dict.fromkeys(ids))
 

@@ -52,7 +52,19 @@ def parse_mesh(data: bytes, name: str) -> Mesh:
     """
     if len(data) > MAX_OBJ_BYTES:
         raise MeshSizeError(f"{name}: {len(data)} bytes; at most {MAX_OBJ_BYTES} are allowed")
-    mesh = parse_stl(data, name) if name.lower().endswith(".stl") else parse_obj(data, name)
+    return checked(parse_stl(data, name) if name.lower().endswith(".stl") else parse_obj(data, name), name)
+
+
+def checked(mesh: Mesh, name: str) -> Mesh:
+    """`mesh`, whose faces name its vertices, if it is small enough, finite, and has an area.
+
+    Raises:
+        MeshSizeError: it is beyond a bound.
+        ObjectError: it is not finite, or no face has an area.
+    """
+    if len(mesh.vertices) > MAX_VERTICES or len(mesh.faces) > MAX_TRIANGLES:
+        raise MeshSizeError(f"{name}: more than {MAX_VERTICES} vertices or {MAX_TRIANGLES} triangles")
+    _bounded(mesh.vertices, name)
     if not _has_area(mesh):
         raise ObjectError(f"{name}: no triangle has an area: each is a line or a point")
     return mesh

@@ -26,6 +26,8 @@ MIN_SIZE = 1e-9
 """Of a shape's lengths and scales; what is smaller has no extent."""
 MAX_NAME = 200
 MAX_PATH = 1000
+MOST_NAMED = 8
+"""Links that a message names."""
 MESH_ENDINGS = (".obj", ".stl")
 _XACRO_TAG = re.compile(r"\{\S*xacro/?\}")
 """Each of the namespaces that xacro has had ends in its name."""
@@ -89,19 +91,36 @@ class Urdf:
         shapes = (shape for link in self.links.values() for shape in (*link.visuals, *link.collisions))
         return tuple(sorted({shape.file for shape in shapes if shape.kind == "mesh"}))
 
+    def below(self, link: str) -> "Urdf":
+        """The tree from `link` on, without the joint that moves it.
 
-def parse_urdf(data: bytes, name: str) -> Urdf:
+        Raises:
+            ObjectError: there is no such link.
+        """
+        if link not in self.links:
+            names = ", ".join(short(name) for name in list(self.links)[:MOST_NAMED])
+            raise ObjectError(f"there is no link {short(link)}; there are {len(self.links)}, such as {names}")
+        kept, joints = {link}, []
+        for joint in self.joints:
+            if joint.parent in kept and joint.child != link:
+                kept.add(joint.child)
+                joints.append(joint)
+        return Urdf({name: each for name, each in self.links.items() if name in kept}, link, tuple(joints))
+
+
+def parse_urdf(data: bytes, name: str, mesh_endings: tuple[str, ...] = MESH_ENDINGS) -> Urdf:
     """Parse and check a URDF document.
 
     Args:
         data: the whole file.
         name: what messages call it.
+        mesh_endings: of the mesh files that it may name.
 
     Raises:
         ObjectError: with one line that says what is wrong and where.
     """
     try:
-        return _checked(_Reader().robot(_parse_xml(data)))
+        return _checked(_Reader(mesh_endings).robot(parse_xml(data, MAX_URDF_BYTES)))
     except ObjectError as error:
         raise ObjectError(f"{name}: {error}") from None
 
@@ -110,6 +129,7 @@ def parse_urdf(data: bytes, name: str) -> Urdf:
 class _Reader:
     """Turns elements into links and joints, counting shapes as it goes."""
 
+    mesh_endings: tuple[str, ...]
     shapes: int = 0
     links: dict[str, Link] = field(default_factory=dict)
 
@@ -140,13 +160,17 @@ class _Reader:
             self.shapes += 1
             if self.shapes > MAX_SHAPES:
                 raise ObjectError(f"more than {MAX_SHAPES} shapes")
-            yield _shape(element)
+            yield _shape(element, self.mesh_endings)
 
 
-def _parse_xml(data: bytes) -> Element:
-    """The root element; document types, entities and external references are refused."""
-    if len(data) > MAX_URDF_BYTES:
-        raise ObjectError(f"{len(data)} bytes; at most {MAX_URDF_BYTES} are allowed")
+def parse_xml(data: bytes, most_bytes: int) -> Element:
+    """The root element; document types, entities and external references are refused.
+
+    Raises:
+        ObjectError: with one line that says what is wrong.
+    """
+    if len(data) > most_bytes:
+        raise ObjectError(f"{len(data)} bytes; at most {most_bytes} are allowed")
     try:
         return cast(Element, defusedxml.ElementTree.fromstring(data, forbid_dtd=True))
     except defusedxml.DefusedXmlException as error:
@@ -193,7 +217,7 @@ def _pose(element: Element) -> Float:
     return pose
 
 
-def _shape(element: Element) -> Shape:
+def _shape(element: Element, mesh_endings: tuple[str, ...]) -> Shape:
     geometry = element.find("geometry")
     found = [(kind, g) for kind in get_args(ShapeKind) for g in (() if geometry is None else geometry.findall(kind))]
     if len(found) != 1:
@@ -204,7 +228,7 @@ def _shape(element: Element) -> Shape:
         scale = _numbers(inner, "scale", "1 1 1", 3)
         if np.abs(scale).min() < MIN_SIZE:
             raise ObjectError(f"a <mesh> needs a scale other than 0 along each axis; given {scale.tolist()}")
-        return Shape(kind, pose, scale, _mesh_file(inner))
+        return Shape(kind, pose, scale, _mesh_file(inner, mesh_endings))
     if kind == "box":
         size = _numbers(inner, "size", "", 3)
     elif kind == "cylinder":
@@ -216,15 +240,15 @@ def _shape(element: Element) -> Shape:
     return Shape(kind, pose, size)
 
 
-def _mesh_file(mesh: Element) -> str:
+def _mesh_file(mesh: Element, endings: tuple[str, ...]) -> str:
     """The file's path as written; which file below the folder that is, is found where it is read."""
     name = mesh.get("filename", "").strip()
     if not name or len(name) > MAX_PATH or not name.isprintable():
         raise ObjectError(f"a mesh must name a file in at most {MAX_PATH} characters; given {short(name)}")
-    if not name.lower().endswith(MESH_ENDINGS):
+    if not name.lower().endswith(endings):
+        how = "import the object by `adaafford objects import`" if endings == MESH_ENDINGS else "convert it"
         raise ObjectError(
-            f"a mesh must be a file of {' or '.join(MESH_ENDINGS)}; given {short(name)}: convert it, for instance by "
-            "trimesh.load(FILE, force='mesh').export('NAME.obj'), and name that instead (docs/objects.md)"
+            f"a mesh must be a file of {' or '.join(endings)}; given {short(name)}: {how} (docs/objects.md)"
         )
     return name
 

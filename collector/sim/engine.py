@@ -22,7 +22,7 @@ Link: TypeAlias = physx.PhysxArticulationLinkComponent
 DENSITY = 1000.0
 """SAPIEN's default; only the shape of a link's inertia matters, since its mass is drawn."""
 
-__all__ = ["DENSITY", "Assembly", "Link", "convex_shapes", "new_scene", "physx", "pose", "sapien", "set_mass"]
+__all__ = ["DENSITY", "Assembly", "Link", "convex_shapes", "cooked", "new_scene", "physx", "pose", "sapien", "set_mass"]
 
 
 def new_scene(solver_iterations: int) -> tuple[sapien.Scene, physx.PhysxCpuSystem]:
@@ -148,3 +148,11 @@ def set_mass(link: Link, mass: float) -> None:
         inertia = np.full(3, mass * 1e-2)
     link.mass = mass
     link.inertia = np.maximum(inertia, 1e-8).astype(np.float32)
+
+
+def cooked(mesh: Mesh) -> Mesh | None:
+    """The convex piece that the engine makes of a mesh, with outward faces; None where it makes none."""
+    shape = _convex_shape(mesh, physx.PhysxMaterial(0.0, 0.0, 0.0))
+    if shape is None:
+        return None
+    return Mesh(np.asarray(shape.vertices, dtype=np.float64), np.asarray(shape.triangles, dtype=np.int32))

@@ -31,6 +31,7 @@ def contact_sheet(
     openness: float = 0.5,
     azimuth_deg: float = 205.0,
     image_size: int = 240,
+    titles: Sequence[str] = (),
 ) -> None:
     """Write a grid of pictures, id and category below each: the body grey, every movable part coloured.
 
@@ -40,6 +41,7 @@ def contact_sheet(
         openness: where every joint stands between its lower limit (0) and its upper limit (1).
         azimuth_deg: of the camera; objects face 180.
         image_size: pixels along an edge of one picture.
+        titles: what is below each picture instead.
 
     Raises:
         UsageError: there is nothing to show, or the file cannot be written.
@@ -53,9 +55,10 @@ def contact_sheet(
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in grid:
         axes.set_axis_off()
-    for axes, target in zip(grid, objects, strict=False):
+    texts = titles or [f"{target.ref.id}\n{target.ref.category}" for target in objects]
+    for axes, target, text in zip(grid, objects, texts, strict=False):
         axes.imshow(picture(target, openness, azimuth_deg, image_size))
-        axes.set_title(f"{target.ref.id}\n{target.ref.category}", fontsize=7, y=-0.12)
+        axes.set_title(text, fontsize=7, y=-0.12)
     figure.subplots_adjust(left=0.0, right=1.0, bottom=0.04, top=1.0, wspace=0.02, hspace=0.16)
     save(figure, out_png)
 

@@ -9,10 +9,11 @@ import pytest
 from collector.objects import procedural
 from collector.objects.articulation import ArticulatedObject, Mesh
 from collector.objects.catalogue import qualifying_parts, scan
-from collector.objects.procedural.assembly import GRID, ProceduralObject, normalised
+from collector.objects.model import ObjectModel
+from collector.objects.procedural.assembly import GRID, normalised
 from collector.objects.procedural.cabinets import storage_furniture
-from collector.objects.procedural.writing import object_files, write_object
 from collector.objects.readers import read_object
+from collector.objects.writing import object_files, write_object
 from shared.errors import UsageError
 from shared.tasks import TASKS
 
@@ -222,7 +223,7 @@ def test_the_ambiguous_tasks_find_their_parts(made: Path) -> None:
 
 
 def test_normalising_keeps_the_shape() -> None:
-    before: ProceduralObject = storage_furniture("left")
+    before: ObjectModel = storage_furniture("left")
     after = normalised(before)
     sizes = [[np.ptp(piece.vertices, axis=0) for piece in a.body] for a in (before, after)]
     ratios = np.array(sizes[1]) / np.array(sizes[0])

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from collector.objects.articulation import ArticulatedObject
+from collector.objects.model import ObjectModel
 from collector.objects.procedural import build
-from collector.objects.procedural.assembly import ProceduralObject, normalised
+from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import storage_furniture
-from collector.objects.procedural.writing import write_object
 from collector.objects.readers import read_object
+from collector.objects.writing import write_object
 from collector.random_proposer import RandomProposer
 from collector.sim.environment import SapienEnvironment
 from collector.stopwatch import StageClock
@@ -107,7 +108,7 @@ def faucets(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     ]
 
 
-def reversed_switches(made: ProceduralObject) -> ProceduralObject:
+def reversed_switches(made: ObjectModel) -> ObjectModel:
     """The assembly with every switch's axis turned round."""
     parts = (
         replace(part, axis=(-part.axis[0], -part.axis[1], -part.axis[2])) if part.name == "switch" else part

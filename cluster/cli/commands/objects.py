@@ -1,8 +1,8 @@
-"""`adaafford objects`: make objects, check them, look at them, decompose them."""
+"""`adaafford objects`: make objects, import and export them, check them, look at them, decompose them."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from pydantic import Field
@@ -11,6 +11,8 @@ from cluster.config.flags import Action, dispatch
 from shared.config import PANDA
 from shared.errors import UsageError
 from shared.io.text import plain
+
+Direction = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 if TYPE_CHECKING:
     from collector.objects.catalogue import CatalogueEntry
@@ -28,6 +30,55 @@ class GenerateCommand:
     """Only these; "train" and "test" stand for the paper's ten and five. All where none is named."""
     seed: int = 1
     """Everything random derives from it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportCommand:
+    """Turn an object of another layout (URDF, MJCF, GAPartNet, Articulate-Anything) into one of ours, and check it."""
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """A .urdf or MJCF .xml file, or an object's folder."""
+    out: Path
+    """Folder of objects; the object becomes a folder in it, and ID.png beside it shows it before and after."""
+    id: str | None = None
+    """What the object is called; the name of its file or folder unless given."""
+    category: str | None = None
+    """Such as Microwave, which tasks ask for; what the source says unless given."""
+    part_names: tuple[str, ...] = ()
+    """Names that tasks ask for, by link or body: `LINK=door`."""
+    front: Direction | None = None
+    """Direction, in the file, that the object's front faces; that of the layout unless given: +x of
+    Articulate-Anything, -x of others."""
+    up: Direction = "+z"
+    """Direction, in the file, that is up."""
+    scale: Annotated[float, Field(gt=0)] | None = None
+    """Multiply all lengths by this instead of giving the object a size."""
+    size: Annotated[float, Field(gt=0)] | None = None
+    """Diagonal of the object's bounding box afterwards; 2, as that of published objects, unless given."""
+    search_path: tuple[Path, ...] = ()
+    """Folders, beside that of the file, where meshes and included files may be."""
+    root: str | None = None
+    """The link or body from which on the object is wanted, where the file holds a robot or a room as well."""
+    radians: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Angles of an MJCF that does not say their unit are radians; MuJoCo takes them for degrees."""
+    replace: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Replace an object of this name that was imported before."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportCommand:
+    """Write objects as URDF or MJCF, with the convex pieces that are simulated, for other programs to read."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """One object's folder, or a folder of objects."""
+    out: Path
+    """Folder; each object becomes a folder in it."""
+    format: Literal["urdf", "mjcf"] = "urdf"
+    """Of the main file, which is called mobility.urdf or object.xml."""
+    collision: Literal["hulls", "decomposed"] = "hulls"
+    """As of a collection: one convex hull a mesh, or several pieces that keep cavities open."""
+    part_mass: Annotated[float, Field(gt=0)] = 0.16
+    """kg, of each movable part; a collection draws it anew for each rollout, from 0.05 to 0.5 unless told otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +142,82 @@ def _generate(command: GenerateCommand) -> int:
     made = generate(command.out, counts, command.seed)
     print(f"{len(made)} objects of {len(counts)} categories in {command.out}")
     return 0
+
+
+def _import(command: ImportCommand) -> int:
+    from collector.objects.catalogue import OBJECT_ID
+    from collector.objects.importing.importer import ImportSettings, import_object
+    from collector.objects.importing.layouts import source_of
+    from collector.objects.importing.placement import USUAL_SIZE, Placement
+    from collector.viz.preview import contact_sheet
+    from shared.errors import ObjectError
+    from shared.extras import require
+
+    require("the picture of an import", "report", without=("plotly", "jinja2"))
+    if command.scale is not None and command.size is not None:
+        raise UsageError("--scale and --size exclude each other; give one of them")
+    source = source_of(command.source)
+    placement = Placement(
+        command.front or source.front, command.up, command.scale, USUAL_SIZE if command.size is None else command.size
+    )
+    names = dict(_assigned(word) for given in command.part_names for word in given.split(",") if word)
+    settings = ImportSettings(
+        command.search_path, placement, command.category, names, command.root, command.radians, command.replace
+    )
+    name = command.id or source.name
+    if not OBJECT_ID.fullmatch(name):
+        raise UsageError(
+            f"'{plain(name, 80)}' cannot be an object's id; give one by --id, which may hold letters, digits, '.', '_' "
+            "and '-', up to 100"
+        )
+    folder = command.out / name
+    try:
+        made = import_object(source, folder, settings)
+    except ObjectError as error:
+        print(plain(f"{folder.name}  refused: {error}"))
+        return UsageError.exit_code
+    sheet = command.out / f"{folder.name}.png"
+    extent = " x ".join(f"{edge:.3g}" for edge in made.extent)
+    before = f"before, {extent}"
+    after = f"after, front {placement.front}, up {placement.up}"
+    contact_sheet([made.before, made.after], sheet, titles=[before, after])
+    movable = _parts(len(made.after.parts))
+    print(plain("; ".join([f"{folder.name}  usable: {made.after.ref.category}, {movable}", *made.notes])))
+    for body in made.after.parts:
+        assert body.joint is not None
+        print(plain(f"  {body.part_name}: {body.joint.kind}, {body.joint.lower:.4g} to {body.joint.upper:.4g}"))
+    print(plain(f"{sheet}: as in the file ({extent}), and as it stands now; its front should face the camera"))
+    return 0
+
+
+def _assigned(word: str) -> tuple[str, str]:
+    link, sign, name = word.rpartition("=")
+    if not sign or not link or not name:
+        raise UsageError(f"--part-names takes LINK=NAME, such as link_1=door; given {word[:80]!r}")
+    return link, name
+
+
+def _export(command: ExportCommand) -> int:
+    from collector.objects.catalogue import load_ref, scan
+    from collector.objects.exporting import export_object
+    from shared.errors import ObjectError
+
+    catalogue = scan(command.path)
+    usable, failed = catalogue.usable, len(catalogue.refused)
+    for object_id, reason in catalogue.refused:
+        print(plain(f"{object_id}  refused: {reason}"))
+    for entry in usable:
+        try:
+            target = load_ref(command.path, entry.ref, command.collision)
+            main = export_object(target, command.format, command.out / entry.ref.id, command.part_mass)
+        except ObjectError as error:
+            failed += 1
+            print(plain(f"{entry.ref.id}  refused: {error}"))
+        else:
+            print(plain(f"{entry.ref.id}  {main}"))
+    exported = len(usable) + len(catalogue.refused) - failed
+    print(f"{exported} exported, {failed} refused")
+    return 0 if exported else UsageError.exit_code
 
 
 def _check(command: CheckCommand) -> int:
@@ -189,6 +316,8 @@ def _parts(count: int) -> str:
 
 ACTIONS: dict[str, Action] = {
     "generate": (GenerateCommand, _generate),
+    "import": (ImportCommand, _import),
+    "export": (ExportCommand, _export),
     "check": (CheckCommand, _check),
     "preview": (PreviewCommand, _preview),
     "film": (FilmCommand, _film),

@@ -2,14 +2,15 @@
 
 import numpy as np
 
-from collector.objects.procedural.assembly import MovablePart, ProceduralObject, hinged, sliding
+from collector.objects.model import MovablePart, ObjectModel, Pieces
+from collector.objects.procedural.assembly import hinged, sliding
 from collector.objects.procedural.cabinets import GAP, knob
-from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, Pieces, block, grip, hollow_box, rod
+from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, rod
 
 BUTTON_TRAVEL = 0.03
 
 
-def random_microwave(rng: np.random.Generator) -> ProceduralObject:
+def random_microwave(rng: np.random.Generator) -> ObjectModel:
     """A door hinged at the left, and buttons and perhaps a dial at its right."""
     width, depth, height = float(rng.uniform(1.2, 1.5)), float(rng.uniform(0.8, 1.0)), float(rng.uniform(0.65, 0.85))
     panel, thickness = float(rng.uniform(0.25, 0.35)), 0.05
@@ -26,10 +27,10 @@ def random_microwave(rng: np.random.Generator) -> ProceduralObject:
     rows = np.linspace(0.15, 0.55, int(rng.integers(2, 5))) * height
     buttons = [_button(-thickness, middle + y, float(z), 0.045) for z in rows for y in (-0.07, 0.07)]
     dial = [knob("knob", (-thickness, middle, 0.8 * height), 0.07)] if rng.random() < 0.5 else []
-    return ProceduralObject("Microwave", "microwave_body", body, (door, *buttons, *dial))
+    return ObjectModel("Microwave", "microwave_body", body, (door, *buttons, *dial))
 
 
-def random_washing_machine(rng: np.random.Generator) -> ProceduralObject:
+def random_washing_machine(rng: np.random.Generator) -> ObjectModel:
     """A round door before an opening in the front; a dial and buttons above it."""
     width, depth, height = float(rng.uniform(0.95, 1.1)), float(rng.uniform(0.8, 1.0)), float(rng.uniform(1.2, 1.4))
     half, radius, middle = width / 2, 0.36 * width, 0.48 * height
@@ -49,7 +50,7 @@ def random_washing_machine(rng: np.random.Generator) -> ProceduralObject:
     door = hinged("door", disc, corner, LEFT if left else RIGHT, FRONT, float(rng.uniform(1.5, 2.2)))
     dial = knob("knob", (0.0, 0.2 * width, 0.93 * height), 0.05)
     buttons = [_button(0.0, -y * width, 0.93 * height, 0.03) for y in (0.0, 0.12, 0.24)]
-    return ProceduralObject("WashingMachine", "washing_machine_body", body, (door, dial, *buttons))
+    return ObjectModel("WashingMachine", "washing_machine_body", body, (door, dial, *buttons))
 
 
 def _button(face: float, y: float, z: float, half: float) -> MovablePart:

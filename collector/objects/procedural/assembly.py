@@ -1,44 +1,15 @@
 """An object under construction: a static body and the parts that hang on it, all in one frame, all closed."""
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
 from collector.objects.articulation import Mesh
-from collector.objects.procedural.shapes import Pieces, Point, point
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point, point
 from shared.types import Float
 
 GRID = 2.0**-14
 """Coordinates are multiples of this, so that moving them between frames rounds nothing: twins stay identical."""
-
-
-@dataclass(frozen=True, slots=True)
-class MovablePart:
-    """A movable part, in the object's frame, at joint position 0."""
-
-    name: str
-    """Semantic name, as PartNet-Mobility has it."""
-    kind: Literal["revolute", "prismatic"]
-    pieces: Pieces
-    origin: Point
-    """A point on the axis."""
-    axis: Point
-    upper: float
-    """rad or length."""
-    lower: float = 0.0
-    parent: int | None = None
-    """Index of the part that it hangs on; None: the body."""
-
-
-@dataclass(frozen=True, slots=True)
-class ProceduralObject:
-    """A whole object."""
-
-    category: str
-    body_name: str
-    body: Pieces
-    parts: tuple[MovablePart, ...]
 
 
 def hinged(
@@ -73,7 +44,7 @@ def sliding(name: str, pieces: Pieces, direction: Point, upper: float) -> Movabl
     return MovablePart(name, "prismatic", pieces, (0.0, 0.0, 0.0), direction, upper)
 
 
-def normalised(assembly: ProceduralObject) -> ProceduralObject:
+def normalised(assembly: ObjectModel) -> ObjectModel:
     """The object about the origin, its bounding box's diagonal 2, as PartNet-Mobility has it, on the grid."""
     everything = [*assembly.body, *(piece for part in assembly.parts for piece in part.pieces)]
     vertices = np.concatenate([piece.vertices for piece in everything])

@@ -11,20 +11,9 @@ from typing import Literal
 
 import numpy as np
 
-from collector.objects.procedural.assembly import MovablePart, ProceduralObject, hinged, sliding
-from collector.objects.procedural.shapes import (
-    BACK,
-    FRONT,
-    LEFT,
-    RIGHT,
-    TOP,
-    Pieces,
-    Point,
-    block,
-    grip,
-    hollow_box,
-    rod,
-)
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
+from collector.objects.procedural.assembly import hinged, sliding
+from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, rod
 
 GAP = 0.006
 """Between a panel and what it lies on, and between neighbours."""
@@ -123,14 +112,14 @@ class Carcass:
 
 def storage_furniture(
     hinge: Literal["left", "right"], width: float = 1.0, depth: float = 0.7, height: float = 1.4, overhang: float = 0.03
-) -> ProceduralObject:
+) -> ObjectModel:
     """A cabinet with one closed overlay door without a handle: nothing to be seen tells the hinge's side."""
     carcass = Carcass(width, depth, height, 0.03, 0.03, overhang)
     door = FrontPanel("door", (-width / 2, width / 2), (0.0, height), handle=False, hinge=hinge)
-    return ProceduralObject("StorageFurniture", "furniture_body", carcass.shell(), carcass.front([door]))
+    return ObjectModel("StorageFurniture", "furniture_body", carcass.shell(), carcass.front([door]))
 
 
-def random_storage_furniture(rng: np.random.Generator) -> ProceduralObject:
+def random_storage_furniture(rng: np.random.Generator) -> ObjectModel:
     """A cabinet of one of five layouts; two in five hide the hinge's side of a single door."""
     layout = rng.choice(["hidden", "hidden", "doors", "drawers", "mixed"])
     carcass = _random_carcass(rng)
@@ -150,10 +139,10 @@ def random_storage_furniture(rng: np.random.Generator) -> ProceduralObject:
         drawers = _drawers_up(carcass, split, carcass.height, int(rng.integers(1, 3)))
         panels = [*doors, *drawers]
         boards = _boards(carcass, [doors[0], *drawers])
-    return ProceduralObject("StorageFurniture", "furniture_body", carcass.shell() + boards, carcass.front(panels))
+    return ObjectModel("StorageFurniture", "furniture_body", carcass.shell() + boards, carcass.front(panels))
 
 
-def random_refrigerator(rng: np.random.Generator) -> ProceduralObject:
+def random_refrigerator(rng: np.random.Generator) -> ObjectModel:
     """One door, a freezer above, or two doors side by side."""
     carcass = Carcass(
         width=float(rng.uniform(0.65, 0.85)),
@@ -178,10 +167,10 @@ def random_refrigerator(rng: np.random.Generator) -> ProceduralObject:
             boards = carcass.board_between(*panels)
         case _:
             panels = _pair(whole)
-    return ProceduralObject("Refrigerator", "refrigerator_body", carcass.shell() + boards, carcass.front(panels))
+    return ObjectModel("Refrigerator", "refrigerator_body", carcass.shell() + boards, carcass.front(panels))
 
 
-def random_table(rng: np.random.Generator) -> ProceduralObject:
+def random_table(rng: np.random.Generator) -> ObjectModel:
     """A top on four legs, with drawers below it."""
     width, depth, height = float(rng.uniform(1.2, 1.5)), float(rng.uniform(0.6, 0.8)), float(rng.uniform(0.7, 0.9))
     box_height, leg = float(rng.uniform(0.2, 0.3)), 0.05
@@ -201,12 +190,10 @@ def random_table(rng: np.random.Generator) -> ProceduralObject:
         for x in (0.0, back - leg)
         for y in (-(carcass.width - leg) / 2, (carcass.width - leg) / 2)
     )
-    return ProceduralObject(
-        "Table", "furniture_body", (*carcass.shell(), *dividers, top, *legs), carcass.front(drawers)
-    )
+    return ObjectModel("Table", "furniture_body", (*carcass.shell(), *dividers, top, *legs), carcass.front(drawers))
 
 
-def random_safe(rng: np.random.Generator) -> ProceduralObject:
+def random_safe(rng: np.random.Generator) -> ObjectModel:
     """A thick box whose door carries a dial that turns by itself."""
     carcass = Carcass(
         width=float(rng.uniform(0.9, 1.2)),
@@ -225,7 +212,7 @@ def random_safe(rng: np.random.Generator) -> ProceduralObject:
     (door,) = carcass.front([panel])
     face, y = -GAP - carcass.thickness, 0.1 * carcass.width * (1 if side == "left" else -1)
     dial = knob("knob", (face, y, 0.65 * carcass.height), 0.09, parent=0)
-    return ProceduralObject("Safe", "safe_body", carcass.shell(), (door, dial))
+    return ObjectModel("Safe", "safe_body", carcass.shell(), (door, dial))
 
 
 def knob(name: str, centre: Point, radius: float, parent: int | None = None) -> MovablePart:

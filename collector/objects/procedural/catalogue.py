@@ -4,8 +4,9 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from collector.objects.model import ObjectModel
 from collector.objects.procedural.appliances import random_microwave, random_washing_machine
-from collector.objects.procedural.assembly import ProceduralObject, normalised
+from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import (
     random_refrigerator,
     random_safe,
@@ -23,7 +24,7 @@ from collector.objects.procedural.faucets import random_faucet
 from collector.objects.procedural.openings import random_door, random_switch, random_window
 from shared.seeds import generator
 
-CATEGORIES: Mapping[str, Callable[[np.random.Generator], ProceduralObject]] = {
+CATEGORIES: Mapping[str, Callable[[np.random.Generator], ObjectModel]] = {
     "StorageFurniture": random_storage_furniture,
     "Faucet": random_faucet,
     "Box": random_box,
@@ -43,6 +44,6 @@ CATEGORIES: Mapping[str, Callable[[np.random.Generator], ProceduralObject]] = {
 """The paper's fifteen, called as PartNet-Mobility calls them."""
 
 
-def build(category: str, seed: int, index: int) -> ProceduralObject:
+def build(category: str, seed: int, index: int) -> ObjectModel:
     """Object number `index` of a category: a pure function of its arguments, whatever else is made."""
     return normalised(CATEGORIES[category](generator(seed, f"procedural {category}", index)))

@@ -2,25 +2,13 @@
 
 import numpy as np
 
-from collector.objects.procedural.assembly import MovablePart, ProceduralObject, hinged, sliding
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
+from collector.objects.procedural.assembly import hinged, sliding
 from collector.objects.procedural.cabinets import GAP
-from collector.objects.procedural.shapes import (
-    BACK,
-    LEFT,
-    RIGHT,
-    TOP,
-    Pieces,
-    Point,
-    arch,
-    block,
-    hollow_box,
-    moved,
-    rod,
-    tub,
-)
+from collector.objects.procedural.shapes import BACK, LEFT, RIGHT, TOP, arch, block, hollow_box, moved, rod, tub
 
 
-def random_box(rng: np.random.Generator) -> ProceduralObject:
+def random_box(rng: np.random.Generator) -> ObjectModel:
     """A box with one lid hinged at the back, or two flaps that meet in the middle."""
     width, depth, height = float(rng.uniform(0.9, 1.3)), float(rng.uniform(0.7, 1.1)), float(rng.uniform(0.5, 0.9))
     body = hollow_box((0.0, -width / 2, 0.0), (depth, width / 2, height), 0.03, (TOP,))
@@ -33,10 +21,10 @@ def random_box(rng: np.random.Generator) -> ProceduralObject:
             _lid((low[0], GAP / 2, low[2]), high, LEFT, opens),
             _lid(low, (high[0], -GAP / 2, high[2]), RIGHT, opens),
         )
-    return ProceduralObject("Box", "box_body", body, lids)
+    return ObjectModel("Box", "box_body", body, lids)
 
 
-def random_trash_can(rng: np.random.Generator) -> ProceduralObject:
+def random_trash_can(rng: np.random.Generator) -> ObjectModel:
     """A bin, square or round, whose lid turns up at the back."""
     radius, height = float(rng.uniform(0.35, 0.5)), float(rng.uniform(1.0, 1.4))
     overhang, opens = float(rng.uniform(0.02, 0.04)), float(rng.uniform(1.3, 1.9))
@@ -49,10 +37,10 @@ def random_trash_can(rng: np.random.Generator) -> ProceduralObject:
         reach, top = radius + overhang, height + GAP + 0.05
         plate = rod((0.0, 0.0, height + GAP), (0.0, 0.0, top), reach, 0.95 * reach, sides=24)
         lid = hinged("rotation_lid", (plate,), (reach, 0.0, top), BACK, TOP, opens)
-    return ProceduralObject("TrashCan", "trashcan_body", body, (lid,))
+    return ObjectModel("TrashCan", "trashcan_body", body, (lid,))
 
 
-def random_kitchen_pot(rng: np.random.Generator) -> ProceduralObject:
+def random_kitchen_pot(rng: np.random.Generator) -> ObjectModel:
     """A pot with two ears and a loose lid."""
     radius, height = float(rng.uniform(0.5, 0.65)), float(rng.uniform(0.4, 0.8))
     body = tub(0.95 * radius, radius, 0.0, height, 0.04)
@@ -62,10 +50,10 @@ def random_kitchen_pot(rng: np.random.Generator) -> ProceduralObject:
         for y in [side * (radius - 0.02)]
     )
     lid = sliding("lid", _round_lid(1.03 * radius, height), TOP, float(rng.uniform(0.15, 0.3)))
-    return ProceduralObject("KitchenPot", "pot_body", body + ears, (lid,))
+    return ObjectModel("KitchenPot", "pot_body", body + ears, (lid,))
 
 
-def random_bucket(rng: np.random.Generator) -> ProceduralObject:
+def random_bucket(rng: np.random.Generator) -> ObjectModel:
     """A pail whose handle lies forward on its rim and turns up."""
     radius, height = float(rng.uniform(0.5, 0.65)), float(rng.uniform(0.7, 1.0))
     body = tub(float(rng.uniform(0.7, 0.85)) * radius, radius, 0.0, height, 0.03)
@@ -77,10 +65,10 @@ def random_bucket(rng: np.random.Generator) -> ProceduralObject:
     handle = moved(arch(1.18 * radius, 0.025, lean=np.pi / 2), pivot)
     # Turned about +y, what lies towards -x rises.
     part = MovablePart("handle", "revolute", handle, pivot, LEFT, float(rng.uniform(1.5, 2.8)))
-    return ProceduralObject("Bucket", "bucket_body", body + pins, (part,))
+    return ObjectModel("Bucket", "bucket_body", body + pins, (part,))
 
 
-def random_kettle(rng: np.random.Generator) -> ProceduralObject:
+def random_kettle(rng: np.random.Generator) -> ObjectModel:
     """A kettle: spout to the left, handle to the right, lid on top."""
     radius, height = float(rng.uniform(0.4, 0.5)), float(rng.uniform(0.6, 0.9))
     top = 0.7 * radius
@@ -93,7 +81,7 @@ def random_kettle(rng: np.random.Generator) -> ProceduralObject:
         rod(posts[0], posts[1], 0.04, sides=10),
     )
     lid = sliding("lid", _round_lid(0.97 * top, height), TOP, float(rng.uniform(0.1, 0.25)))
-    return ProceduralObject("Kettle", "kettle_body", (*body, spout, *handle), (lid,))
+    return ObjectModel("Kettle", "kettle_body", (*body, spout, *handle), (lid,))
 
 
 def _lid(low: Point, high: Point, edge: Point, opens: float) -> MovablePart:

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from collector.objects.procedural.assembly import MovablePart, ProceduralObject
-from collector.objects.procedural.shapes import BOTTOM, TOP, Pieces, Point, block, moved, rod
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
+from collector.objects.procedural.shapes import BOTTOM, TOP, block, moved, rod
 
 
-def random_faucet(rng: np.random.Generator) -> ProceduralObject:
+def random_faucet(rng: np.random.Generator) -> ObjectModel:
     """One switch on top of the column, or two on pedestals beside it; the sense of each axis is drawn."""
     height, radius = float(rng.uniform(0.7, 1.1)), float(rng.uniform(0.08, 0.13))
     reach = float(rng.uniform(0.7, 1.0))
@@ -30,8 +30,8 @@ def random_faucet(rng: np.random.Generator) -> ProceduralObject:
     switches = [_switch(str(style), stand, size, heading, upper, rng) for stand in stands]
     if twin and rng.random() < 0.4:
         turning = MovablePart("spout", "revolute", spout, (0.0, 0.0, height), TOP, np.pi / 2)
-        return ProceduralObject("Faucet", "faucet_base", body, (*switches, turning))
-    return ProceduralObject("Faucet", "faucet_base", body + spout, tuple(switches))
+        return ObjectModel("Faucet", "faucet_base", body, (*switches, turning))
+    return ObjectModel("Faucet", "faucet_base", body + spout, tuple(switches))
 
 
 def _spout(reach: float, height: float, radius: float) -> Pieces:

@@ -4,25 +4,13 @@ from typing import Literal
 
 import numpy as np
 
-from collector.objects.procedural.assembly import MovablePart, ProceduralObject, hinged, sliding
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
+from collector.objects.procedural.assembly import hinged, sliding
 from collector.objects.procedural.cabinets import GAP
-from collector.objects.procedural.shapes import (
-    BACK,
-    BOTTOM,
-    FRONT,
-    LEFT,
-    RIGHT,
-    TOP,
-    Pieces,
-    Point,
-    block,
-    grip,
-    hollow_box,
-    ring,
-)
+from collector.objects.procedural.shapes import BACK, BOTTOM, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, ring
 
 
-def random_door(rng: np.random.Generator) -> ProceduralObject:
+def random_door(rng: np.random.Generator) -> ObjectModel:
     """A frame and one door, or two."""
     width, height = float(rng.uniform(0.8, 1.2)), float(rng.uniform(1.4, 1.7))
     depth, post = float(rng.uniform(0.08, 0.12)), 0.08
@@ -35,10 +23,10 @@ def random_door(rng: np.random.Generator) -> ProceduralObject:
     else:
         leaves = [((-half, 0.0), False), ((0.0, half), True)]
     doors = tuple(_leaf(y, height, 0.6 * depth, left, opens) for y, left in leaves)
-    return ProceduralObject("Door", "door_frame", frame, doors)
+    return ObjectModel("Door", "door_frame", frame, doors)
 
 
-def random_window(rng: np.random.Generator) -> ProceduralObject:
+def random_window(rng: np.random.Generator) -> ObjectModel:
     """A frame with two sashes: casements that turn outward, or one that slides behind the other's plane."""
     width, height, bar = float(rng.uniform(1.0, 1.4)), float(rng.uniform(1.0, 1.4)), 0.06
     half = width / 2
@@ -50,14 +38,14 @@ def random_window(rng: np.random.Generator) -> ProceduralObject:
             _casement(low_y, high_y, height, edge, opens)
             for low_y, high_y, edge in ((low[1], high[1], RIGHT), (-high[1], -low[1], LEFT))
         )
-        return ProceduralObject("Window", "window_frame", frame, sashes)
+        return ObjectModel("Window", "window_frame", frame, sashes)
     fixed = _sash((0.09, 0.0, 0.0), (0.14, half, height), bar)
     slider = _sash((0.02, -half + GAP, GAP), (0.07, bar, height - GAP), bar)
     slider += grip((0.02, -half + bar, height / 2), TOP, FRONT, 0.25, 0.05, 0.012)
-    return ProceduralObject("Window", "window_frame", frame + fixed, (sliding("window", slider, LEFT, 0.85 * half),))
+    return ObjectModel("Window", "window_frame", frame + fixed, (sliding("window", slider, LEFT, 0.85 * half),))
 
 
-def random_switch(rng: np.random.Generator) -> ProceduralObject:
+def random_switch(rng: np.random.Generator) -> ObjectModel:
     """A plate on a wall with one to three levers, each flipped up or down."""
     count = int(rng.integers(1, 4))
     pitch, height, reach = 0.45, float(rng.uniform(0.9, 1.3)), float(rng.uniform(0.2, 0.35))
@@ -65,7 +53,7 @@ def random_switch(rng: np.random.Generator) -> ProceduralObject:
     style: Literal["lever", "rocker"] = "lever" if rng.random() < 0.6 else "rocker"
     middles = (np.arange(count) - (count - 1) / 2) * pitch
     levers = tuple(_lever(float(y), reach, style) for y in middles)
-    return ProceduralObject("Switch", "switch_frame", (plate,), levers)
+    return ObjectModel("Switch", "switch_frame", (plate,), levers)
 
 
 def _leaf(y: tuple[float, float], height: float, thickness: float, left: bool, opens: float) -> MovablePart:

@@ -11,10 +11,7 @@ import numpy as np
 
 from collector.objects import meshes
 from collector.objects.articulation import Mesh
-from shared.types import Float
-
-Point = tuple[float, float, float]
-Pieces = tuple[Mesh, ...]
+from collector.objects.model import Pieces, Point, point
 
 FRONT: Point = (-1.0, 0.0, 0.0)
 BACK: Point = (1.0, 0.0, 0.0)
@@ -113,12 +110,6 @@ def grip(centre: Point, along: Point, outward: Point, length: float, stand_off: 
 def moved(pieces: Pieces, by: Point) -> Pieces:
     """The pieces, shifted."""
     return tuple(Mesh(piece.vertices + np.array(by), piece.faces) for piece in pieces)
-
-
-def point(vector: Float) -> Point:
-    """A triple of plain floats."""
-    x, y, z = (float(number) for number in vector)
-    return x, y, z
 
 
 _STAVE_FACES = meshes.box(np.ones(3)).faces
