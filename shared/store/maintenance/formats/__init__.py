@@ -3,6 +3,7 @@
 They differ in their files and in what stands around these; the rows come from `shared.store.maintenance.steps`.
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +46,11 @@ class ExportFormat:
     schema: Callable[[Content], Any] = lambda content: None
 
 
+def word(text: str) -> str:
+    """A text of a store, which may be anybody's, as a part of a file's name that leads nowhere."""
+    return re.sub(r"[^A-Za-z0-9_-]", "-", text)
+
+
 def nothing_to_finish(content: Content, folder: Path, summaries: Sequence[Summary]) -> None:
     """The `finish` of a format whose pieces are all that there is."""
 
@@ -55,6 +61,9 @@ EXPORT_FORMATS = Registry(
     {
         PLAIN: "shared.store.maintenance.formats.plain:PLAIN",
         "hf": "shared.store.maintenance.formats.hf:HF",
+        "lerobot": "shared.store.maintenance.formats.lerobot:LEROBOT",
+        "webdataset": "shared.store.maintenance.formats.webdataset:WEBDATASET",
+        "minari": "shared.store.maintenance.formats.minari:MINARI",
     },
 )
 """By name; those of other packages come by the entry points `adaafford.export_formats`."""
