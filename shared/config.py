@@ -93,6 +93,11 @@ class CameraConfig(StrictModel):
     keep_depth: bool = Field(False, exclude_if=lambda kept: not kept)
     """Keep the whole depth image of each observation beside its cloud, some KB, which `network.pinch_profile` needs."""
 
+    @property
+    def depth_size(self) -> int:
+        """Width and height of the depth images that are kept, pixels; 0: none is."""
+        return self.image_size if self.keep_depth else 0
+
     @model_validator(mode="after")
     def _enough_candidates(self) -> "CameraConfig":
         if self.candidates < self.points:

@@ -83,6 +83,15 @@ def make_folder(path: Path) -> None:
         raise UsageError(f"{path}: no folder can be made of this name ({error.strerror}); name another") from None
 
 
+def sync_file(path: Path) -> None:
+    """Force a file that others wrote to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def sync_folder(path: Path) -> None:
     """Force a folder's entries (creations, renames) to the disk, where the file system can do that."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)

@@ -42,7 +42,7 @@ def observations_at(store: "Store", places: Iterable[tuple[str, int]]) -> Iterat
 def stacked(found: Iterable[Observation], count: int, camera: CameraConfig) -> ObservationArrays:
     """`count` observations of a camera as arrays, with their depth images where it keeps them."""
     # Filled one by one, since a list of so many arrays would be in memory beside what they are stacked into.
-    pixels = camera.image_size if camera.keep_depth else 0
+    pixels = camera.depth_size
     arrays = {kind.name: np.empty((count, *kind.shape(camera.points, pixels)), kind.seen) for kind in kinds(pixels)}
     for number, observation in enumerate(found):
         for name, field in fields_of(observation).items():

@@ -19,6 +19,7 @@ from shared.plan import Job, Plan
 from shared.store import Store, compact, export, merge, verify
 from shared.store.codecs.observations import ARRAYS
 from shared.store.maintenance.export import splits_by_share
+from shared.store.maintenance.formats import plain
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting, identical
 from tests.support.faults import Fault, disk_faults
 
@@ -159,8 +160,8 @@ def test_an_export_writes_what_many_shards_hold_together(tmp_path: Path, monkeyp
     store = make(tmp_path / "store", *((k, k + 1) for k in range(10)))
     splits = {"train": frozenset(ref.id for ref in SETTING.objects)}
     export(store, tmp_path / "whole", splits)
-    monkeypatch.setitem(export.__globals__, "SHARDS_A_GROUP", 4)
-    monkeypatch.setitem(export.__globals__, "CLOUDS_A_CHUNK", 3)
+    monkeypatch.setattr(plain, "SHARDS_A_GROUP", 4)
+    monkeypatch.setattr(plain, "CLOUDS_A_CHUNK", 3)
     export(store, tmp_path / "parts", splits)
     files = [pq.ParquetFile(tmp_path / name / "train/interactions.parquet") for name in ("whole", "parts")]
     # What is known of each group is in memory until the file is closed.

@@ -53,12 +53,15 @@ class MergeCommand:
 
 @dataclass(frozen=True, slots=True)
 class ExportCommand:
-    """Write a store as plain files, one Parquet and one Zarr group a split, with a data card."""
+    """Write a store as plain files that other tools open, with a data card. The same command again goes on."""
 
     store: Annotated[str, tyro.conf.Positional]
     """Folder or s3:// URL of the store."""
     out: Path
     """A new folder."""
+    format: str = "plain"
+    """plain (Parquet and Zarr), hf (Parquet with the clouds), lerobot, webdataset, minari, or one of an installed
+    package."""
     test_share: float = 0.0
     """Share of each category's objects that go into the split "test"; without it there is one split, "train"."""
     seed: int = 1
@@ -187,7 +190,11 @@ def _export(command: ExportCommand) -> int:
         raise UsageError("--test-share and lists of objects exclude each other; give one")
     with Progress(f"exporting into {command.out}, shards") as progress:
         done = export(
-            store, command.out, splits or splits_by_share(store, command.test_share, command.seed), progress.show
+            store,
+            command.out,
+            splits or splits_by_share(store, command.test_share, command.seed),
+            progress.show,
+            format=command.format,
         )
     if command.json:
         described = {
