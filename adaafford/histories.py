@@ -1,4 +1,4 @@
-"""Histories: what was tried on one object so far, as a JSON file that people and robots may write.
+"""Histories: the interactions with one object so far, as a JSON file that people and robots may write.
 
 {
   "format": "adaafford-history", "schema_version": 1,
@@ -9,8 +9,8 @@
   ]
 }
 
-Everything is in the frame of the clouds, in metres and radians; `cloud` names a file beside the history or below. An
-interaction without an outcome is a proposal that nobody has tried yet.
+Everything is in the frame of the clouds, in metres and radians; `cloud` is a file in the folder of the history or
+below. An interaction without an outcome is a proposal that was not executed yet.
 """
 
 import json
@@ -59,37 +59,37 @@ ScanName = Annotated[str, AfterValidator(scan_name)]
 
 
 class TriedOutcome(StrictModel):
-    """What came of a try."""
+    """The outcome of an interaction."""
 
     motion: float = Field(ge=0, le=100)
     """How far the part moved: rad if it turns, m if it slides; 0 for nothing, or for a grasp that slipped."""
     success: bool | None = None
-    """Whether it moved as intended (a pull pulled); where nothing is said, whether it moved by more than 0.01."""
+    """Whether it moved as intended (a pull pulled); default: whether it moved by more than 0.01."""
     kind: OutcomeKind = OutcomeKind.OK
-    """How the try ended; of what a simulator tells, a robot may know "no-contact" or "no-grasp"."""
+    """How the interaction ended; of these kinds, a robot usually knows only "no-contact" and "no-grasp"."""
 
     @property
     def outcome(self) -> Outcome:
-        """As policies are told it."""
+        """The outcome in the form that policies read."""
         moved = self.kind is OutcomeKind.OK and self.motion > SUCCESS_MOTION
         return Outcome(self.kind, self.motion, moved if self.success is None else self.success)
 
 
 class TriedInteraction(StrictModel):
-    """One try, or a proposal for one."""
+    """One interaction, or a proposal for one."""
 
     cloud: ScanName
-    """The scan that was taken before it: a path relative to the history, which does not lead out of its folder."""
+    """The scan before the interaction: a path relative to the history, inside its folder."""
     cloud_sha256: str | None = Field(None, pattern=r"^[0-9a-f]{64}$")
-    """Of that file: a scan that was written over since is not what the try was made on. Unchecked where left out."""
+    """The hash of that file, which reveals a scan that was overwritten; None: not checked."""
     point: Vector
-    """Where the fingertips go."""
+    """The target of the fingertips."""
     approach: Vector
-    """The way the hand moves when it approaches."""
+    """The approach direction of the hand."""
     forward: Vector
-    """The hand's forward direction, which says how it is rolled (see docs/robot.md)."""
+    """The hand's forward direction, which defines its roll (see docs/robot.md)."""
     outcome: TriedOutcome | None = None
-    """None until it is tried."""
+    """None until the interaction was executed."""
 
     @field_validator("cloud")
     @classmethod
@@ -110,22 +110,22 @@ class History(StrictModel):
 
     @property
     def pending(self) -> TriedInteraction | None:
-        """The proposal that waits for its outcome."""
+        """The proposal without an outcome, if there is one."""
         return self.interactions[-1] if self.interactions and self.interactions[-1].outcome is None else None
 
     @property
     def tried(self) -> tuple[TriedInteraction, ...]:
-        """The tries that came to an end."""
+        """The interactions with an outcome."""
         return tuple(each for each in self.interactions if each.outcome is not None)
 
     def proposing(self, action: Action, cloud: str, cloud_sha256: str) -> "History":
-        """This history with a proposal in its end, in the place of one that nobody tried.
+        """This history with a proposal at its end; it replaces one that was not executed.
 
         Raises:
-            UsageError: it is full.
+            UsageError: the history is full.
         """
         if len(self.tried) >= MAX_TRIES:
-            raise UsageError(f"the history holds {MAX_TRIES} tries, which is all that it may; begin another")
+            raise UsageError(f"the history holds {MAX_TRIES} interactions, which is the maximum; begin another")
         frame = self.frame
         proposal = TriedInteraction(
             cloud=cloud,
@@ -148,17 +148,17 @@ class History(StrictModel):
         return self.model_copy(update={"interactions": (*self.tried, last)})
 
     def interactions_with(self, observe: Callable[[TriedInteraction], Observation]) -> list[Interaction]:
-        """The tries as a policy is told them.
+        """The interactions in the form that policies read.
 
         Args:
-            observe: gives the observation that a try was made on.
+            observe: gives the observation before an interaction.
 
         Raises:
-            UsageError: a cloud cannot be read, or a try does not lie on its cloud.
+            UsageError: a cloud cannot be read, or an interaction point is not on its cloud.
         """
         found = []
         for each in self.tried:
-            assert each.outcome is not None, "a try has an outcome"
+            assert each.outcome is not None, "an interaction has an outcome"
             observation = observe(each)
             action = action_at(observation, self.frame, each.point, each.approach, each.forward)
             found.append(Interaction(observation, action, each.outcome.outcome))

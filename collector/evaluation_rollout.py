@@ -1,9 +1,9 @@
 """Evaluation rollouts: the paper's test-time procedure, for every method on the same object and hidden dynamics.
 
-Every method starts from the same state. Its tries continue one another; after each budget the action that its adapted
-affordance chooses is executed from where the tries left the object (as in the paper), and undone. Tries that leave an
-object in the middle of its range, where it can be moved either way, make that easy whatever they taught; so another
-action is chosen and executed where all methods began.
+Every method starts from the same state, and its interactions continue each other. After each budget, the action that
+its adapted affordance chooses is executed from the state that the interactions left (as in the paper), and the state is
+restored. This action is easy if the interactions left the object in the middle of its range, where it can be moved both
+ways. So another action is chosen and executed from the start state, which is the same for all methods.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from shared.policies.methods import method_named
 from shared.types import Float, Interaction, Proposer, Role
 
 ProposerFactory = Callable[[str, np.random.Generator, int], Proposer]
-"""Makes the proposer of a name, such as "aip", with its own randomness, of a policy version."""
+"""Makes a proposer from its name, such as "aip", a random generator, and a policy version."""
 
 
 def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: ProposerFactory) -> None:
@@ -66,16 +66,16 @@ def _adapt(
     budgets: list[int],
     start: Float,
 ) -> None:
-    """Fill the set of interactions one try at a time; at each budget, execute what the method would do, and undo it."""
+    """Collect the method's interactions one at a time; at each budget, execute its action and restore the state."""
     environment, history = recorder.environment, list[Interaction]()
     for budget in budgets:
-        if context is not None:  # A proposer that has seen enough leaves the greater budgets with what there is.
+        if context is not None:  # A proposer may stop before the greater budgets.
             left_to_try = budget - len(history)
             history += recorder.interact(context, left_to_try, Role.CONTEXT, history=history, method=method)
         if not recorder.sound or not environment.observe().movable.any():
             return
         left = environment.state()
-        # Without tries, the one is the other.
+        # Without interactions, both states are the same.
         for role, state in ((Role.EXPLOIT, left), (Role.EXPLOIT_AT_START, start))[: 1 if context is None else 2]:
             recorder.interact(exploiter, 1, role, history=history, start=state, method=method, budget=budget)
             if not recorder.sound:

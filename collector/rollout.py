@@ -82,7 +82,7 @@ def make_environment(
 def collect(
     plan: Plan, index: int, recorder: Recorder, states: np.random.Generator, make_proposer: ProposerFactory
 ) -> None:
-    """Training data: tries that continue, a policy's if there is one; then random ones from one state after another."""
+    """Collect training data: first interactions that continue, by the policy if there is one, then random ones."""
     rollout = plan.setting.collection.rollout
     rng = seeds.generator(plan.setting.seed, f"actions/{plan.key}", index)
     random: Proposer = RandomProposer(rng, plan.setting.terms.edge_share)

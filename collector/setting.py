@@ -20,7 +20,7 @@ def make_setting(
     Args:
         task: the task; one that has no name in a registry is written out.
         collection: what it leaves to the task is filled in.
-        evaluation: what is tried on each object, in a store of an evaluation.
+        evaluation: methods and budgets, in a store of an evaluation.
         rest: the other fields of `Setting`.
 
     Raises:

@@ -211,13 +211,13 @@ class RolloutConfig(StrictModel):
     order: Order = Order.RESTART
     """Order of the random interactions; those of AIP always continue, and come first."""
     continued: int = Field(0, ge=0)
-    """Restart order: how many random interactions come first, each continuing the last, as tries do at test time. They
-    teach AAP what a try tells that begins where another ended, which is not what it tells from a state drawn anew."""
+    """Restart order: how many random interactions at the start continue each other, as at test time. From them AAP
+    learns to interpret an interaction that begins where another one ended."""
     actions_per_state: int = Field(8, ge=1)
-    """Restart order: actions tried from one observed state."""
+    """Restart order: actions executed from one observed state."""
     edge_share: float | None = Field(None, ge=0, le=1)
-    """Share of random actions at points near a part's edge, where a gripper finds something to pinch; the rest anywhere
-    on the movable parts, as published. None: the task's own."""
+    """Share of random actions at points near a part's edge, where a gripper can pinch it; the rest are anywhere on
+    the movable parts, as published. None: the task's own."""
     context: int = Field(4, ge=0)
     """How many interactions, at the most, AIP proposes at the start of a rollout in rounds that use it."""
 

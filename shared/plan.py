@@ -1,7 +1,7 @@
 """Plans: pure functions from configuration and seed to numbered rollouts.
 
-A *setting* fixes everything that makes rows comparable; a store holds one. A *plan* adds who proposes. A *job* is a
-range of a plan's rollouts and makes one *shard*. Nothing here knows who does the work, or when.
+A *setting* fixes everything that makes rows comparable; a store holds one. A *plan* adds the proposer. A *job* is a
+range of a plan's rollouts and makes one *shard*. Nothing here depends on workers or on time.
 """
 
 from collections.abc import Iterable
@@ -25,7 +25,7 @@ class ObjectRef(StrictModel):
 
     @property
     def identity(self) -> tuple[str, str, str]:
-        """What rows name it by, without what newer software may have added."""
+        """Its identity in rows, without fields that newer software may have added."""
         return self.id, self.category, self.content_hash
 
 
@@ -36,18 +36,18 @@ def parse_plan_key(key: str) -> tuple[str, int]:
 
 
 ROLLOUTS_PER_SHARD = 8
-"""Unless told otherwise: some seconds' work, which is what a kill can cost, of which the commit takes a few percent."""
+"""The default: some seconds of work, which a kill can cost at most; the commit takes a few percent of them."""
 Budget = Annotated[int, Field(ge=1, le=64)]
-"""A number of tries."""
+"""A number of interactions."""
 
 
 class EvaluationConfig(StrictModel):
-    """What is tried on each test object."""
+    """Methods and budgets of an evaluation, and the number of queries."""
 
     methods: tuple[MethodName, ...] = ("where2act", "ours-random", "ours-final")
     budgets: tuple[Budget, ...] = Field((1, 2, 4), min_length=1)
     queries: int = Field(24, ge=1)
-    """Random test interactions a rollout, which critics are asked about (F-score)."""
+    """Random test interactions of each rollout, whose success the critics predict (F-score)."""
 
 
 class Setting(StrictModel):
@@ -112,7 +112,7 @@ def found_by_name(task: Task, evaluation: EvaluationConfig | None) -> list[tuple
 
 
 class Plan(StrictModel):
-    """A setting, and who proposes the interactions."""
+    """A setting with a proposer and a policy version."""
 
     setting: Setting
     proposer: str = Field("random", pattern=r"^[a-z][a-z0-9-]{0,30}$")

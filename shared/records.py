@@ -23,7 +23,7 @@ class InteractionRecord:
         proposer: who chose the action.
         policy_version: the policy that it used; 0 for none.
         method: evaluation only: whose context or exploit it is, else "".
-        budget: evaluation only: how many tries came before an exploit, else -1.
+        budget: evaluation only: number of interactions before an exploit, otherwise -1.
         target_part: 1-based movable part that p lies on.
         target_link: its link's name in the URDF.
         target_joint: its joint's name in the URDF.
@@ -85,7 +85,7 @@ class RolloutRecord:
         seed: the plan's seed, from which all of the rollout was drawn.
         fidelity: name of the fidelity preset.
         status: whether it was executed; there are neither observations nor interactions if not.
-        observations: each one once, however many actions were tried from it.
+        observations: each one once, for any number of actions.
         interactions: in the order they were executed.
     """
 

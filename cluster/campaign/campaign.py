@@ -181,7 +181,7 @@ class Campaign:
         )
 
     def _evaluate(self) -> Mapping[str, Any]:
-        """Try every method on unseen objects with the last policy, and write the table."""
+        """Evaluate every method on unseen objects with the last policy, and write the table."""
         run, rollouts, version = self._run, self._config.rollouts, self._config.alternations + 1
         evaluation = Evaluation(
             store=Store.open(run.evaluation),

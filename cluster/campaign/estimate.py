@@ -168,11 +168,11 @@ class _Costs:
         )
 
     def _evaluation(self, rollouts: int) -> StageCost:
-        """Random queries, then every method's tries, each from a state of its own, and its actions."""
+        """Random queries, then the interactions of every method, each with a new observation, and its actions."""
         told = self.config.evaluation
         methods = [METHODS.get(name) for name in told.methods]
         tries = [max(method.budgets(told.budgets)) if method.tries else 0 for method in methods]
-        # Twice where there are tries: where these left the object, and where they began.
+        # With interactions, two actions: from the state that they left, and from the one in which they began.
         chosen = sum(len(method.budgets(told.budgets)) * (2 if method.tries else 1) for method in methods)
         by_policy = chosen + sum(n for n, m in zip(tries, methods, strict=True) if m.tries not in (None, RANDOM))
         interactions = rollouts * (told.queries + sum(tries) + chosen)
@@ -254,7 +254,7 @@ class _Costs:
         return 3 * FORWARD_SHARE * self.encode_s + 2 * (points + 100) * self.rates.scored_row_s
 
     def _clouds_a_rollout(self, tries: int) -> int:
-        """How often a rollout looks: before each try that continues the last, then before each state's random ones."""
+        """How many observations a rollout has: one for each continuing interaction and for each drawn state."""
         told = self.config.collection.rollout
         if told.order is Order.CONTINUE and not tries:
             return told.interactions

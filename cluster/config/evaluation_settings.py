@@ -15,9 +15,9 @@ class EvaluateSettings(ObjectSelection):
     methods: tuple[MethodName, ...] = ()
     """Which methods are compared; all whose networks the run has trained where none is named."""
     budgets: tuple[Budget, ...] = Field((1, 2, 4), min_length=1)
-    """After how many tries they are judged."""
+    """Numbers of interactions after which methods are evaluated."""
     trials: int = Field(10, ge=1, le=100_000)
-    """Trials an object: each draws hidden dynamics and a camera, tries and acts anew. As published: 10."""
+    """Trials of each object, each with new hidden dynamics and a new camera. As published: 10."""
     queries: int = Field(24, ge=1, le=10_000)
     """Random test interactions a trial, which critics are asked about (F-score)."""
     policy: int | None = Field(None, ge=1)

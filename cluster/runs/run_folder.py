@@ -6,11 +6,11 @@ RUN/
   objects.json           which objects were split how, and which were refused and why
   objects/               procedural objects, if no folder of objects was given
   store/                 the interactions, and the published policies
-  evaluation/            a second store: what was tried on unseen objects
+  evaluation/            a second store: the interactions with unseen objects
   training/<stage>/      checkpoints, metrics and output of each training stage
   log.jsonl              the run log: stages, times, results
   summary.json           figures
-  affordance.png         one object before and after each try
+  affordance.png         one object before and after each interaction
   report.html            all of it to look at, in one file
 
 The folder may be renamed, moved or copied: nothing in it is found by an absolute path. Objects that lie elsewhere are

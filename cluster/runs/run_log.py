@@ -77,7 +77,7 @@ class RunLog:
 
         Args:
             stages: what to do, by names that are the same in every attempt; each returns its result.
-            say: is told which stage begins, and which were done before.
+            say: receives a line for each stage that begins or was already done.
         """
         before = [name for name in stages if name in self._results]
         if before:

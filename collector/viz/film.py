@@ -33,7 +33,7 @@ DYNAMICS = HiddenDynamics(part_mass=0.2, joint_friction=0.3, surface_friction=2.
 SEEN_FROM = (190.0, 40.0)
 """Azimuth and elevation, deg, of the camera whose cloud the actions are drawn from."""
 STATES, TRIES = 12, 20
-"""States drawn for a primitive at the most, and random actions tried from each of them."""
+"""States drawn for a primitive at the most, and random actions executed from each of them."""
 ENOUGH = 4
 """Successes, of which the one that takes the touched point the farthest is shown."""
 EDGE_SHARE = 0.5

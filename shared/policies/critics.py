@@ -1,6 +1,6 @@
-"""Critics at test time: what a history of tries makes a method believe of actions and points.
+"""Critics at test time: scores of actions and points, given a history of interactions.
 
-Shapes: N points of a cloud, A actions, S proposals at a point, K tries, Q points asked about.
+Shapes: N points of a cloud, A actions, S proposals at a point, K interactions, Q queried points.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from shared.types import Action, Float32, Interaction, Observation
 
 
 class Critic(Protocol):
-    """What every method's beliefs look like to a proposer."""
+    """Scores actions and points, given a history."""
 
     name: CriticName
 
@@ -74,7 +74,7 @@ def best_action(
 
 
 class Where2ActCritic:
-    """The prior, which knows nothing of tries."""
+    """The prior, which ignores the history."""
 
     name: CriticName = "where2act"
 

@@ -1,4 +1,4 @@
-"""Proposers that use a policy: what to try next, and what to do in the end.
+"""Proposers that use a policy: for the next interaction, and for the final action.
 
 Everything here runs on the CPU in a few milliseconds a step and depends on its random generator alone.
 """
@@ -21,13 +21,13 @@ stop at once; 0 stops where no point promises any gain."""
 
 
 class AipProposer:
-    """What to try next, by the AIP module (AdaAfford, Next-step Interaction Action Proposal).
+    """Proposes the next interaction by the AIP module (AdaAfford, Next-step Interaction Action Proposal).
 
-    The point with the highest AIP actionability among the movable ones, and there the best by the AIP critic of 100
-    rotations from the prior's proposal network. Stops when the budget is reached, or when the highest actionability is
+    It chooses the movable point with the highest AIP actionability, and there the best of 100 rotations of the prior's
+    proposal network by the AIP critic. It stops when the budget is reached, or when the highest actionability is
     below the threshold (AdaAfford, Stopping Criterion).
 
-    Deviation: `at_least` tries are made whatever the threshold says, since no history at all tells nothing.
+    Deviation: `at_least` interactions are proposed in spite of the threshold, because an empty history reveals nothing.
     """
 
     name = "aip"
@@ -66,10 +66,10 @@ AIP = ProposerKind(AipProposer, ("prior", "aap", "aip"))
 
 
 class ExploitProposer:
-    """The action that a critic believes in most (AdaAfford, Evaluation Metrics, sample-success).
+    """Proposes the action with the best score of a critic (AdaAfford, Evaluation Metrics, sample-success).
 
-    A random one of the 100 movable points with the highest actionability, and there the best by the critic of 100
-    rotations from the prior's proposal network.
+    It draws one of the 100 movable points with the highest actionability, and chooses there the best of 100 rotations
+    of the prior's proposal network by the critic.
     """
 
     def __init__(self, adapter: Adapter, rng: np.random.Generator, critic: CriticName = "aap") -> None:
@@ -89,16 +89,16 @@ class ExploitProposer:
 
 
 def proposer_named(name: str, adapter: Adapter | None, rng: np.random.Generator, budget: int) -> Proposer:
-    """The proposer that rows call `name`.
+    """The proposer called `name`.
 
     Args:
-        name: one of `shared.policies.methods.PROPOSERS`, or a critic's, to exploit what it believes.
-        adapter: the policy; None where the proposer needs none.
-        rng: draws what it draws.
-        budget: how many tries it may propose.
+        name: one of `shared.policies.methods.PROPOSERS`, or the name of a critic, for a proposer that exploits it.
+        adapter: the policy; None if the proposer needs none.
+        rng: of its random draws.
+        budget: how many interactions it may propose.
 
     Raises:
-        UsageError: there is none of that name, or the networks that it needs are not trained.
+        UsageError: no proposer has this name, or the networks that it needs are not trained.
     """
     if name in PROPOSERS.names():
         kind = PROPOSERS.get(name)

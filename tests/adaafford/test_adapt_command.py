@@ -303,7 +303,7 @@ def test_a_session_fills_its_history_and_then_acts(policy_folder: Path, scan: Pa
 
 
 def test_a_scan_that_was_written_over_is_noticed(policy_folder: Path, scan: Path) -> None:
-    """A robot that saves every scan under one name would tell the policy of tries on what it never saw."""
+    """A robot that saves every scan under one name would give the policy interactions with scans that it never saw."""
     live = session(policy_folder, scan)
     live.step(scan)
     np.savez(scan, points=front(seed=2))
@@ -311,7 +311,7 @@ def test_a_scan_that_was_written_over_is_noticed(policy_folder: Path, scan: Path
     assert renewed.tries == 0
     live.step(scan, TriedOutcome(motion=0.2))
     np.savez(scan, points=front(seed=3))
-    with pytest.raises(UsageError, match="give every scan a name of its own"):
+    with pytest.raises(UsageError, match="use a new file name for every scan"):
         live.step(scan, TriedOutcome(motion=0.2))
     later = scan.with_name("scan-2.npz")
     scan.rename(later)
@@ -502,7 +502,7 @@ def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
         (["--outcome", "-1"], "--outcome: setting 'motion'"),
         (["--kind", "no-grasp"], "give --outcome MOTION"),
         (["--out", "heat.obj"], "not a kind of heatmap"),
-        (["--budget", "0"], "at least one try"),
+        (["--budget", "0"], "at least one interaction"),
         (["--points", "9"], "allowed are 64 to 16384"),
     ):
         assert adaafford(["adapt", *where, *wrong]) == 2

@@ -13,7 +13,7 @@ from shared.policies.methods import method_named
 
 @dataclass(frozen=True, slots=True)
 class EvaluateCommand:
-    """Try methods on objects that were not trained on, and write the table as Markdown, CSV and JSON.
+    """Evaluate methods on objects that were not trained on, and write the table as Markdown, CSV and JSON.
 
     The same command again goes on where it was stopped, and ends in the same table.
     """

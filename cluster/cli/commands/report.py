@@ -17,7 +17,7 @@ class ReportCommand:
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run."""
     experiments: bool = True
-    """Try a test object under other hidden facts in the simulator, and show what the affordance makes of it."""
+    """Simulate a test object with other hidden facts, and show the affordance for each of them."""
 
 
 def main(args: list[str]) -> int:
