@@ -18,7 +18,7 @@ class ShadowedError(ImportError):
 
 
 def require_own_packages() -> None:
-    """See that none of our packages is shadowed by something else of its name.
+    """Check that none of our packages is shadowed by something else of its name.
 
     Raises:
         ShadowedError: one is; the message names it and says what to do. Uncaught, it shows as one line.

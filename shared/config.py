@@ -107,7 +107,7 @@ class Timing(StrictModel):
     leg_steps: int = Field(ge=1)
     """Steps of one leg of a primitive."""
     hold_steps: int = Field(ge=0)
-    """Steps of hold after a leg, at the most."""
+    """The most steps of hold after a leg."""
 
     @property
     def pace(self) -> float:
@@ -126,7 +126,7 @@ class Fidelity(StrictModel):
     """Until the fingers have closed. The dampers of the hand's drives are weaker by as much as it is faster, so that
     its forces stay as published."""
     drag: Timing = Timing(steps_per_second=240, leg_steps=480, hold_steps=480)
-    """The second leg of every primitive but push: whether what is pinched or dragged slips hangs on its speed."""
+    """The second leg of every primitive but push: whether a pinched or dragged part slips depends on its speed."""
     push_solver_iterations: int = Field(10, ge=1, le=255)
     """Of the engine, for the primitive push, and for others that do not need friction."""
     solver_iterations: int = Field(20, ge=1, le=255)
@@ -136,7 +136,7 @@ class Fidelity(StrictModel):
     end_holds_at_rest: bool = True
     """End a hold once neither hand nor object moves."""
     jointed_hand: bool = False
-    """Let the hand hang on six joints, as published, instead of floating freely under the same drives."""
+    """Attach the hand to six joints, as published, instead of a free body with the same drives."""
 
 
 FIDELITIES = {
@@ -189,7 +189,7 @@ class DynamicsRanges(RootModel[dict[Annotated[str, Field(pattern=NAME)], Range]]
         return [(HIDDEN_PARAMETERS, name) for name in self.added]
 
     def check_known(self) -> None:
-        """See that the packages of all parameters are installed, before anything is drawn.
+        """Check that the packages of all parameters are installed, before anything is drawn.
 
         Raises:
             UsageError: one is not.
@@ -219,7 +219,7 @@ class RolloutConfig(StrictModel):
     """Share of random actions at points near a part's edge, where a gripper can pinch it; the rest are anywhere on
     the movable parts, as published. None: the task's own."""
     context: int = Field(4, ge=0)
-    """How many interactions, at the most, AIP proposes at the start of a rollout in rounds that use it."""
+    """The most interactions that AIP proposes at the start of a rollout, in rounds that use it."""
 
 
 class CollectionConfig(StrictModel):

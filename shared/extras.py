@@ -13,7 +13,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
 
 
 def require(purpose: str, *extras: str, without: tuple[str, ...] = ()) -> None:
-    """See that the packages of some extras are installed, before any work starts.
+    """Check that the packages of some extras are installed, before any work starts.
 
     Args:
         purpose: what needs them, as the subject of a sentence.
@@ -28,7 +28,7 @@ def require(purpose: str, *extras: str, without: tuple[str, ...] = ()) -> None:
 
 
 def require_packages(purpose: str, *packages: str) -> None:
-    """See that packages are installed.
+    """Check that packages are installed.
 
     Raises:
         UsageError: one is not.

@@ -41,7 +41,7 @@ class HiddenTarget(Protocol):
 
     @property
     def joints(self) -> Sequence[Any]:
-        """The simulator's own handles of the joints that they hang on."""
+        """The simulator's own handles of their joints."""
         ...
 
 

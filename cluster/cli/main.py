@@ -141,7 +141,7 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
     except KeyboardInterrupt:
         return _interrupted(args)
     except BrokenPipeError:
-        # Whoever read our output has enough (`adaafford ... | head`).
+        # The reader of our output has closed it (`adaafford ... | head`).
         return 128 + signal.SIGPIPE
     except OSError as error:
         logger.info("what the system refused", exc_info=True)

@@ -103,7 +103,7 @@ class CampaignConfig(ObjectSelection):
     workers: int = Field(2, ge=0, le=4096)
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""
     ray_address: RayAddress | None = None
-    """Of a running Ray cluster; a private session on this machine where none is given."""
+    """HOST:PORT of a running Ray cluster, or auto; default: a private session on this machine."""
     rollout_limit_s: float = Field(300.0, gt=0)
     """A worker that takes longer for one rollout is taken for hung, and replaced; after three times the rollout is
     quarantined."""

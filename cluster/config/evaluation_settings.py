@@ -13,7 +13,7 @@ class EvaluateSettings(ObjectSelection):
     task: str | None = None
     """Another task than the run's, of the same primitive."""
     methods: tuple[MethodName, ...] = ()
-    """Which methods are compared; all whose networks the run has trained where none is named."""
+    """The methods; default: all whose networks the run has trained."""
     budgets: tuple[Budget, ...] = Field((1, 2, 4), min_length=1)
     """Numbers of interactions after which methods are evaluated."""
     trials: int = Field(10, ge=1, le=100_000)
@@ -21,7 +21,7 @@ class EvaluateSettings(ObjectSelection):
     queries: int = Field(24, ge=1, le=10_000)
     """Random test interactions a trial, which critics are asked about (F-score)."""
     policy: int | None = Field(None, ge=1)
-    """Version of the run's policy; the last where none is named."""
+    """Version of the run's policy; default: the last."""
     seed: int | None = Field(None, ge=0, lt=2**63)
     """Instead of the run's."""
     per_shard: int = Field(4, ge=1, le=4096)
@@ -29,7 +29,7 @@ class EvaluateSettings(ObjectSelection):
     workers: int = Field(2, ge=0, le=4096)
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""
     ray_address: RayAddress | None = None
-    """Of a running Ray cluster; a private session on this machine where none is given."""
+    """HOST:PORT of a running Ray cluster, or auto; default: a private session on this machine."""
     rollout_limit_s: float = Field(600.0, gt=0)
     """A worker that takes longer for one trial is taken for hung, and replaced."""
     memory_limit_mb: float = Field(2000.0, gt=0)

@@ -55,7 +55,7 @@ def objects_for(
 
 
 def require_same_objects(wanted: Iterable[ObjectRef], folder: Path) -> None:
-    """See that a folder holds some objects, by their content; it may hold others, too.
+    """Check that a folder holds some objects, by their content; it may hold others, too.
 
     Raises:
         UsageError: it cannot be read, or an object is missing or has other content.

@@ -31,11 +31,11 @@ class ObjectSelection(StrictModel):
     task_definition: Annotated[Task | None, tyro.conf.Suppress] = Field(None, exclude_if=lambda task: task is None)
     """What the file said."""
     objects: Path | None = None
-    """A folder of objects in PartNet-Mobility's layout; built-in procedural objects where none is given."""
+    """A folder of objects in PartNet-Mobility's layout; default: procedural objects."""
     object_list: Path | None = None
     """Only the objects of this list, `<id> <category>` a line, such as Where2Act publishes."""
     categories: tuple[str, ...] = ()
-    """Only objects of these; "train" and "test" stand for the paper's ten and five. All where none is named."""
+    """Only objects of these; "train" and "test" stand for the paper's ten and five. Default: all."""
 
     @property
     def task_record(self) -> Task:

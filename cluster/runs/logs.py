@@ -2,7 +2,7 @@
 
     ADAAFFORD_LOG=json adaafford collect ... 2>log.jsonl
 
-Whoever logs gives what a line is about as `extra`, by the names in `FIELDS`; people get the message alone.
+A log call gives the subject of a line as `extra`, with the names in `FIELDS`; the text format has only the message.
 """
 
 import json

@@ -1,20 +1,20 @@
-"""The folder of a run: what lies where, which configuration it belongs to, and what made it.
+"""The folder of a run: its files, its configuration, and the software that made it.
 
 RUN/
   config.json            resolved configuration, git commit, package versions; written once
-  places.json            where on this machine lies what is not in the run; leave it out where the run is published
-  objects.json           which objects were split how, and which were refused and why
+  places.json            paths of files outside the run on this machine; leave it out when you publish the run
+  objects.json           the split of the objects, and refused objects with reasons
   objects/               procedural objects, if no folder of objects was given
   store/                 the interactions, and the published policies
   evaluation/            a second store: the interactions with unseen objects
   training/<stage>/      checkpoints, metrics and output of each training stage
   log.jsonl              the run log: stages, times, results
-  summary.json           figures
+  summary.json           results
   affordance.png         one object before and after each interaction
-  report.html            all of it to look at, in one file
+  report.html            all results on one page
 
-The folder may be renamed, moved or copied: nothing in it is found by an absolute path. Objects that lie elsewhere are
-known by their content, so that they may move, too (`adaafford resume RUN --objects FOLDER`).
+The folder may be renamed, moved or copied, because it contains no absolute paths. Objects outside it are identified by
+their content, so they may move, too (`adaafford resume RUN --objects FOLDER`).
 """
 
 import json
@@ -35,14 +35,14 @@ from shared.store.provenance import software_versions
 
 MAX_DOCUMENT_BYTES = 64 << 20
 PLACE_SETTINGS = ("objects", "object_list", "start_from", "splits.train_list", "splits.test_list", "ray_address")
-"""Settings that say where something is; config.json has their last parts alone, and places.json the rest."""
+"""Settings that are paths; config.json has only their last parts, and places.json has the whole paths."""
 
 
 class ObjectsUsed(StrictModel):
     """objects.json: the objects of a run."""
 
     folder: str
-    """What the folder is called; `RunFolder.objects_folder` finds it."""
+    """Name of the folder; `RunFolder.objects_folder` gives its path."""
     train: tuple[ObjectRef, ...]
     validation: tuple[ObjectRef, ...]
     test: tuple[ObjectRef, ...]
@@ -51,7 +51,7 @@ class ObjectsUsed(StrictModel):
 
     @property
     def all(self) -> tuple[ObjectRef, ...]:
-        """Those of all three parts."""
+        """The objects of all three sets."""
         return (*self.train, *self.validation, *self.test)
 
 
@@ -215,7 +215,7 @@ def find(path: Path) -> tuple[RunFolder, CampaignConfig]:
 
 
 def note_places(run: RunFolder, config: CampaignConfig) -> None:
-    """Take note that what a run needs lies elsewhere now."""
+    """Record the new path of something that the run needs."""
     _write_places(run, config.model_dump(mode="json"))
 
 
@@ -259,7 +259,7 @@ def _with_settings(settings: Mapping[str, Any], values: Mapping[str, str | None]
 
 
 def _foreign(path: Path) -> list[Path]:
-    """What lies in a folder apart from hidden files and places.json, which a killed attempt may have left."""
+    """The files in a folder, without hidden files and places.json, which a killed attempt may have left."""
     own = RunFolder(path).places
     return [child for child in path.iterdir() if not child.name.startswith(".") and child != own]
 

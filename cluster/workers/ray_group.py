@@ -34,7 +34,7 @@ START_LIMIT_S = 120.0
 """The start of an actor's process imports an engine and PyTorch, which is slow on a busy machine or a cold disk."""
 GRACE_S = 5.0
 """The driver waits this much longer than the actor's own watchdog, because only the watchdog writes a traceback."""
-LOST = "its process was lost without a word: killed from outside, or for want of memory"
+LOST = "its process was lost without a traceback: killed from outside, or out of memory"
 KEPT = 3
 """How many plans and policies stay in the object store; only retries of failed jobs still need older ones."""
 POLL_S = 1.0
@@ -64,7 +64,7 @@ class Actor(Protocol):
 
 
 class ProcessActor:
-    """An `Actor`: a process of its own, with one CPU. No restarts by Ray, which would run only `__init__` again."""
+    """An `Actor` in a separate process with one CPU; without restarts by Ray, which only repeat `__init__`."""
 
     def __init__(self, make_worker: WorkerFactory, crash_log: CrashLog, limits: Limits) -> None:
         actor: Any = ray.remote(num_cpus=1, max_restarts=0)(WorkerActor)

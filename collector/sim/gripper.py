@@ -3,7 +3,8 @@
 The hand frame's columns are forward, left, up, where *up* is the approach direction. Every hand ends `TIP_DISTANCE`
 ahead of its frame's origin when closed, so that primitives mean the same for all of them. There are two ways to make a
 hand fly: the free one here, whose palm floats and is driven in all six directions at once, and the published one in
-`collector.sim.jointed_gripper`, whose palm hangs on six joints and which costs the engine twice as much a step.
+`collector.sim.jointed_gripper`, whose palm is attached to six joints and which costs the engine twice as much for each
+step.
 
 Where the hand is, [4], counts from where it was placed: forward, left, up (m) and its turn about up (rad).
 """

@@ -1,4 +1,4 @@
-"""The flying hand as published: its palm hangs on three sliding and three turning joints, each with a drive.
+"""The flying hand as published: its palm is attached to three sliding and three turning joints, each with a drive.
 
 The reference fidelity uses it, and so does the published protocol against which collection is timed.
 """

@@ -78,7 +78,7 @@ class Take:
 
     @property
     def caption(self) -> str:
-        """What came of it, in a few words."""
+        """The outcome in a few words."""
         success = "success" if self.outcome.success else "failure"
         return f"{self.primitive}: {self.outcome.kind.value}, {success}, m = {self.outcome.motion:.3f}"
 

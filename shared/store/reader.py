@@ -201,7 +201,7 @@ def _table(shard: Folder, manifest: ShardManifest, file: str, data: bytes, names
 
 
 def _check_interactions(table: Any, source: str, manifest: ShardManifest) -> None:
-    """See that the references of a shard's interactions lead to what the shard has."""
+    """Check that the references of a shard's interactions lead to what the shard has."""
     ranges = {
         "rollout": (manifest.start, manifest.stop),
         "observation": (0, manifest.observations),
@@ -220,7 +220,7 @@ def _check_interactions(table: Any, source: str, manifest: ShardManifest) -> Non
 
 
 def _check_rollouts(table: Any, source: str, manifest: ShardManifest) -> None:
-    """See that the rollouts of a shard add up to what the manifest says."""
+    """Check that the rollouts of a shard add up to what the manifest says."""
     clouds, tries, firsts, numbers = (table.column(name).to_numpy() for name in _COUNTING)
     most = max(manifest.observations, manifest.interactions)
     if min(clouds.min(), tries.min()) < 0 or max(clouds.max(), tries.max()) > most:

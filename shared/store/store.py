@@ -131,7 +131,7 @@ class Store:
         return cls(backend, parse_store_document(backend.read(STORE_FILE, MAX_DOCUMENT_BYTES), f"{where}/{STORE_FILE}"))
 
     def as_of(self, snapshot: Snapshot) -> "Store":
-        """The store as it was when it held these rollouts, for whoever reads it while others add to it."""
+        """The store restricted to these rollouts, for readers while others collect into it."""
         store = Store(self.backend, self.document)
         store._snapshot = snapshot
         return store
@@ -239,19 +239,19 @@ class Store:
         *,
         vetted: bool = False,
     ) -> ShardManifest:
-        """Store the rollouts of a job as one shard: wholly or not at all, and once, however many workers try.
+        """Store the rollouts of a job as one shard: atomically, and only once if several workers do it.
 
         Args:
-            plan: whose job it is.
+            plan: the plan of the job.
             job: the range of rollouts.
             rollouts: all of them, in order.
-            provenance: what is known of how they were made, such as seconds by stage; not part of the digest.
-            quarantined: why rollouts of that status are; likewise no part of it.
-            vetted: whether a driver has seen that no shard holds these rollouts. Otherwise the names of all shards are
-                listed for it, which takes the longer the more there are. Readers count each rollout once in any case.
+            provenance: facts about their origin, such as seconds by stage; not part of the digest.
+            quarantined: the reasons of quarantined rollouts; not part of the digest.
+            vetted: whether the caller has checked that no shard has these rollouts. Otherwise the names of all shards
+                are listed, which takes longer for larger stores. Readers count each rollout once in any case.
 
         Returns:
-            The manifest; that of the shard which was there already, where another worker was faster.
+            The manifest; if another worker was faster, that of its shard.
 
         Raises:
             StoreError: the rollouts are not the job's, break the rules of a record, or overlap another shard.
@@ -328,7 +328,7 @@ class Store:
         return table
 
     def rollouts(self) -> Any:
-        """A pyarrow table, one row a rollout, those without interactions included; "shard" says where it lies.
+        """A pyarrow table, one row a rollout, including those without interactions; "shard" is the name of its shard.
 
         Raises:
             StoreError: a file is damaged or foreign.
@@ -375,7 +375,7 @@ class Store:
 
     @property
     def path(self) -> Path:
-        """The folder of a store that lies on a disk.
+        """The folder of a store on a disk.
 
         Raises:
             UsageError: it lies in a bucket.

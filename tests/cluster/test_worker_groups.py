@@ -247,7 +247,7 @@ def test_a_rollout_whose_process_is_always_killed_is_quarantined_at_last(
     (tmp_path / "die-1").write_text("99")
     assert run(ray_worker_group, 3) == [job.shard_id for job in jobs(3)]
     assert begun(tmp_path, jobs(3)[1]) == MAX_LOSSES + 1
-    assert "killed from outside, or for want of memory" in (tmp_path / "quarantined-1").read_text()
+    assert "killed from outside, or out of memory" in (tmp_path / "quarantined-1").read_text()
 
 
 def test_processes_killed_at_random_are_no_rollouts_fault(

@@ -22,7 +22,7 @@ class EvaluateCommand:
     run: Path
     """Folder of a run that has published a policy."""
     out: Path | None = None
-    """Folder for the trials and the table; where none is given, one below RUN/evaluations that the settings name."""
+    """Folder for the trials and the table; default: one in RUN/evaluations, named after the settings."""
 
 
 def main(args: list[str]) -> int:

@@ -1,4 +1,4 @@
-"""`adaafford report`: a run's results as a page, and on the terminal again."""
+"""`adaafford report`: the results of a run as a page and on the terminal."""
 
 import sys
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from cluster.config.flags import parse_flags
 
 @dataclass(frozen=True, slots=True)
 class ReportCommand:
-    """Make RUN/report.html, summary.json and affordance.png of a finished run anew, and print its table."""
+    """Write RUN/report.html, summary.json and affordance.png of a finished run again, and print its table."""
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run."""
