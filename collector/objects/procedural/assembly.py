@@ -1,4 +1,4 @@
-"""An object under construction: a static body and its parts, all in one frame, all closed."""
+"""An object under construction: a static body and the parts that hang on it, all in one frame, all closed."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -28,7 +28,7 @@ class MovablePart:
     """rad or length."""
     lower: float = 0.0
     parent: int | None = None
-    """Index of the parent part; None: the body."""
+    """Index of the part that it hangs on; None: the body."""
 
 
 @dataclass(frozen=True, slots=True)

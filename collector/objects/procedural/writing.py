@@ -19,12 +19,12 @@ _MOTION_WORDS = {"revolute": "hinge", "prismatic": "slider"}
 
 
 def generate(out: Path, counts: Mapping[str, int], seed: int) -> list[Path]:
-    """Write `counts[category]` objects of each category to `out`; existing objects are kept.
+    """Write `counts[category]` objects of each category below `out`; what is there already is kept.
 
     Object number i of a category depends on the seed, the category and i alone. An object appears whole or not at all.
 
     Args:
-        out: folder of objects, created if missing.
+        out: folder of objects; made if need be.
         counts: how many of each category of `CATEGORIES`.
         seed: of the whole collection, non-negative.
 
@@ -99,7 +99,7 @@ def _urdf(assembly: ProceduralObject, links: list[str]) -> str:
 
 
 def _parent(assembly: ProceduralObject, part: MovablePart) -> tuple[int, Point]:
-    """Index among links, and frame origin, of the part's parent."""
+    """Index among links, and frame origin, of what the part hangs on."""
     if part.parent is None:
         return 0, (0.0, 0.0, 0.0)
     return part.parent + 1, assembly.parts[part.parent].origin
