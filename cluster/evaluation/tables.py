@@ -30,14 +30,14 @@ MEASURES: Mapping[Measure, str] = {
 """What methods are compared by, and what people call it; the paper has no figures of the last."""
 _SHOWN: Mapping[str, str] = {
     "method": "method",
-    "budget": "tries",
+    "budget": "interactions",
     **{str(name): shown for name, shown in MEASURES.items()},
     "gap_closed": "gap closed",
     "trials": "trials",
     "best_f": "best F",
     "bce": "BCE",
     "auc": "AUC",
-    "mean_tries": "tries made",
+    "mean_tries": "interactions made",
 }
 """Columns that people see, and what they call them."""
 _PERCENT = frozenset({*MEASURES, "gap_closed", "best_f"})

@@ -1,4 +1,4 @@
-"""Stage 2: Adaptive Affordance Prediction, as in the paper or with an oracle as teacher, which is given the hidden facts.
+"""Stage 2: Adaptive Affordance Prediction, as in the paper or taught by an oracle that is given the hidden facts.
 
 Shapes: I interactions, B rollouts, n rows of each, K the longest context.
 """
