@@ -211,7 +211,7 @@ def parse_json(model: type[Model], data: bytes, source: str, remedy: str) -> Mod
 
 def _without_doubles(pairs: list[tuple[str, object]]) -> None:
     if (name := named_twice(pairs)) is not None:
-        raise ValueError(f"the name '{shown([name])}' stands twice")
+        raise ValueError(f"the name '{shown([name])}' occurs twice")
 
 
 def write_history(path: Path, history: History) -> None:

@@ -126,7 +126,7 @@ class ScanFrame(StrictModel):
         place = self.to_world([self.camera])[0]
         distance = float(np.linalg.norm(place))
         if distance < 1e-3:
-            raise UsageError("the camera stands in the middle of the cloud; say where it stood in the cloud's frame")
+            raise UsageError("the camera is in the middle of the cloud; give its position in the cloud's frame")
         elevation = np.clip(np.rad2deg(np.arcsin(place[2] / distance)), -89.9, 89.9)
         return camera_pose(float(np.rad2deg(np.arctan2(place[1], place[0]))), float(elevation), distance)
 
@@ -266,7 +266,7 @@ def doubtful_up(scan: Scan, frame: ScanFrame) -> str | None:
     up = " ".join(f"{value:g}" for value in frame.up)
     axes, probable = ("y down, z forward", "0 -1 0") if sight > 0 else ("y up, z backward", "0 1 0")
     return (
-        f"with up {up} the camera stands {abs(elevation):.0f} deg {side} the object; in a camera's own frame (x right, "
+        f"with up {up} the camera is {abs(elevation):.0f} deg {side} the object; in a camera's own frame (x right, "
         f"{axes}) up is probably {probable}"
     )
 
@@ -287,7 +287,7 @@ def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = PO
     kept = furthest_first(scan.points, points, max(CANDIDATES, points), rng)
     places = frame.to_world(scan.points[kept])
     if np.abs(places).max() > 2 * MAX_EXTENT_M:
-        raise UsageError("the cloud lies far from the origin of its frame; all scans of a history share one frame")
+        raise UsageError("the cloud is far from the origin of its frame; all scans of a history share one frame")
     normals = np.zeros_like(places) if scan.normals is None else scan.normals[kept] @ frame.world_from_scan.T
     unknown = np.linalg.norm(normals, axis=1) <= _MIN_NORMAL
     if unknown.any():

@@ -174,7 +174,7 @@ class Session:
             return history
         if not self._files.history.parent.is_dir():
             raise UsageError(
-                f"{self._files.history.parent}: there is no such folder; make it, and put the clouds there"
+                f"{self._files.history.parent}: there is no such folder; create it, and put the clouds there"
             )
         path, data, sha256 = self._file(name)
         scan = parse_scan(data, path)
@@ -192,7 +192,7 @@ class Session:
             name = Path(os.path.realpath(cloud)).relative_to(folder).as_posix()
         except ValueError:
             raise UsageError(
-                f"{cloud}: does not lie beside the history or below; put it into {folder}, so that both stay together"
+                f"{cloud}: is not in the folder of the history or below; put it into {folder} to keep both together"
             ) from None
         try:
             return scan_name(name)

@@ -81,7 +81,7 @@ class Campaign:
             run_log.note("attempt", workers=config.workers, software=software_versions())
             changed = changed_versions(run.begun_with())
             if changed and any(step.name not in run_log.finished for step in steps):
-                self._say(f"begun with other software: {changed}; what is made from here on may differ by it")
+                self._say(f"begun with other software: {changed}; new results may differ because of it")
             with worker_groups(config.workers, config.limits, config.ray_address) as make_worker_group:
                 self._crew = Crew(make_worker_group)
                 run_log.run({step.name: partial(self._do, step) for step in steps}, self._say)

@@ -176,7 +176,7 @@ def dispatch(name: str, actions: Mapping[str, Action], args: list[str], operand:
     chosen, first = args[:1], next(iter(actions))
     if chosen in (["-h"], ["--help"]):
         print(
-            f"usage: adaafford {name} {{{','.join(actions)}}} {operand}; `adaafford {name} {first} --help` tells more"
+            f"usage: adaafford {name} {{{','.join(actions)}}} {operand}; `adaafford {name} {first} --help` shows more"
         )
         return 0
     if not chosen or chosen[0] not in actions:

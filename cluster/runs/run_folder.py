@@ -184,7 +184,7 @@ def begin(path: Path, config: CampaignConfig) -> RunFolder:
     if path.exists() and not path.is_dir():
         raise UsageError(f"{path}: not a folder; name a new one")
     if not run.config.exists() and path.exists() and any(_foreign(path)):
-        raise UsageError(f"{path}: holds something that is no run; name a new or an empty folder")
+        raise UsageError(f"{path}: holds something that is not a run; name a new or an empty folder")
     path.mkdir(parents=True, exist_ok=True)
     if not run.config.exists():
         # First, since with config.json a run has begun.

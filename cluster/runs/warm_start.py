@@ -65,4 +65,4 @@ def seen_by(source: str) -> frozenset[str]:
 
 def unknown(source: str) -> str:
     """What to tell of a policy that `seen_by` knows nothing of."""
-    return f"'{source}' does not say what objects it has learned from; it may be tested on some of them"
+    return f"'{source}' has no record of its training objects; some of them may be used for testing"

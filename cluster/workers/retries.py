@@ -156,9 +156,9 @@ class RetryPolicy:
         if in_a_row >= MAX_ALIKE or alike >= max(MAX_ALIKE, self._succeeded):
             raise JobError(
                 job,
-                f"{max(in_a_row, MAX_ALIKE)} different rollouts failed in the same way ({failure.reason}), so that "
-                "this machine, a setting or an object is at fault; none of them is stored: mend it and give the same "
-                "command again, with --retry-quarantined if `adaafford store info` lists others",
+                f"{max(in_a_row, MAX_ALIKE)} different rollouts failed in the same way ({failure.reason}), so "
+                "this machine, a setting or an object is the cause; none of them is stored: correct it and give the "
+                "same command again, with --retry-quarantined if `adaafford store info` lists others",
             )
 
     def require_any_success(self, job: Job, *, ever: bool) -> None:
@@ -177,7 +177,7 @@ class RetryPolicy:
             raise JobError(
                 job,
                 f"no rollout succeeded, and rollout {rollout} failed again and again: {reason}; nothing was stored: "
-                "mend what it says and give the same command again",
+                "correct the cause and give the same command again",
             )
 
     def _charge_no_rollout(self, job: Job, failure: Failure, count: int) -> None:

@@ -235,7 +235,7 @@ def _load(folder: Path, tree: Path, ref: ObjectRef) -> ArticulatedObject:
     if loaded.ref != ref:
         raise ObjectError(
             f"{folder}: is not the object that was planned ({loaded.ref.id} {loaded.ref.content_hash[:12]} instead of "
-            f"{ref.id} {ref.content_hash[:12]}); restore its files or start anew"
+            f"{ref.id} {ref.content_hash[:12]}); restore its files or start another run"
         )
     return loaded
 

@@ -92,4 +92,4 @@ def named_twice(pairs: list[tuple[str, Any]]) -> str | None:
 
 def _refuse_twins(pairs: list[tuple[str, Any]]) -> None:
     if (name := named_twice(pairs)) is not None:
-        raise ValueError(f"'{plain(name, MAX_WORD)}' stands twice")
+        raise ValueError(f"'{plain(name, MAX_WORD)}' occurs twice")

@@ -382,7 +382,7 @@ class Store:
         """
         if is_url(self.where):
             raise UsageError(
-                f"{self.where}: lies in no folder; copy it by `adaafford store merge {self.where} --out DIR`"
+                f"{self.where}: is not in a folder; copy it by `adaafford store merge {self.where} --out DIR`"
             )
         return Path(self.where)
 

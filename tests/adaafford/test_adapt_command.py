@@ -280,7 +280,7 @@ def test_an_export_leaves_other_files_alone(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("")
     assert adaafford(["export-policy", str(run.path), "--out", str(tmp_path / "mine")]) == 2
-    assert "holds something that is no exported policy" in capsys.readouterr().err
+    assert "holds something that is not an exported policy" in capsys.readouterr().err
 
 
 # The loop.
@@ -358,7 +358,7 @@ def test_misuse_is_refused_and_changes_nothing(policy_folder: Path, scan: Path, 
     with pytest.raises(UsageError, match="was begun with up"):
         session(policy_folder, scan, up=(0.0, 1.0, 0.0)).step(scan)
     np.savez(tmp_path / "elsewhere.npz", points=front())
-    with pytest.raises(UsageError, match="does not lie beside the history"):
+    with pytest.raises(UsageError, match="is not in the folder of the history"):
         session(policy_folder, scan).step(tmp_path / "elsewhere.npz")
     scan.with_name("loop.npz").symlink_to("loop.npz")
     for name in (f"{'x' * 300}.npz", "loop.npz"):
@@ -475,7 +475,7 @@ def test_a_request_is_read(line: bytes) -> None:
     ("line", "expected"),
     [
         (b"\xff\xfe{\0", "UTF-16"),
-        (b'{"cloud": "a.ply", "cloud": "b.ply"}', "the name 'cloud' stands twice"),
+        (b'{"cloud": "a.ply", "cloud": "b.ply"}', "the name 'cloud' occurs twice"),
         (b'{"cloud": "a\\u001b.ply"}', "cloud: Value error, needs a name without control characters"),
         (b'{"cloud": "a.ply", "outcome": {"motion": NaN}}', "outcome.motion"),
         (b"[" * 60_000, "Invalid JSON"),

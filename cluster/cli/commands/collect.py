@@ -137,7 +137,9 @@ def run_collection(command: CollectCommand) -> None:
     )
     store = Store.create(where, setting)
     if changed := changed_versions(store.document.software):
-        print(f"{store.where}: begun with other software: {changed}; what is added may differ by it", file=sys.stderr)
+        print(
+            f"{store.where}: begun with other software: {changed}; new rows may differ because of it", file=sys.stderr
+        )
     plan: Plan | Newest
     if command.policy == "latest":
         plan = Newest(command.proposer, chosen.per_version)

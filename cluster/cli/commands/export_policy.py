@@ -46,7 +46,9 @@ def main(args: list[str]) -> int:
     if command.out.exists() and (
         not command.out.is_dir() or any(path.name not in files for path in command.out.iterdir())
     ):
-        raise UsageError(f"{command.out}: holds something that is no exported policy; name a new or an empty folder")
+        raise UsageError(
+            f"{command.out}: holds something that is not an exported policy; name a new or an empty folder"
+        )
     command.out.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         write_atomically(command.out / name, data)

@@ -252,7 +252,7 @@ def _check_place(command: CheckPlaceCommand) -> int:
             raise UsageError(f"--{name} {given}: allowed: {least} to {most}")
     place = backend_of(command.place)
     if not place.is_there():
-        raise UsageError(f"{command.place}: there is no such folder; make it, or name another")
+        raise UsageError(f"{command.place}: there is no such folder; create it, or name another")
     try:
         check_place(place, command.writers, command.rounds)
     except OSError as error:

@@ -201,7 +201,7 @@ class BucketPlace:
             return request()
         except (FileNotFoundError, GenericError) as error:
             if "NoSuchBucket" in str(error):
-                raise UnreadableError(f"{self.where}: there is no such bucket; make it, or name another") from None
+                raise UnreadableError(f"{self.where}: there is no such bucket; create it, or name another") from None
             if not isinstance(error, FileNotFoundError):
                 raise self._out_of_reach(key, error) from None
             if not missing_is_error:
