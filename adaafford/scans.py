@@ -149,13 +149,13 @@ class ScanFrame(StrictModel):
 def read_scan(path: Path) -> Scan:
     """Read a cloud from a PLY, NPZ or PCD file.
 
-    PLY and PCD: x y z, and, where they are there, normals (nx ny nz or normal_x ...) and `movable`. NPZ: `points`, and
+    PLY and PCD: x y z, and optionally normals (nx ny nz or normal_x ...) and `movable`. NPZ: `points`, and
     optionally `normals`, `movable` and `camera`. Points that are 0 0 0 or not finite were not measured: they are left
     out. Normals of this kind are estimated.
 
     Raises:
-        UsageError: it is no such file, or holds no cloud of finite points in metres.
-        StoreError: it cannot be read, or is too large.
+        UsageError: the file has another format, or no cloud of finite points in metres.
+        StoreError: the file cannot be read, or is too large.
     """
     return parse_scan(read_scan_file(path), path)
 

@@ -1,4 +1,4 @@
-"""Configuration models, one a concern, every default in one place; TOML files and flags are read through them."""
+"""Configuration models, one for each concern, with all defaults; TOML files and flags are read through them."""
 
 import difflib
 import tomllib
@@ -32,13 +32,13 @@ class StrictModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def as_document(self) -> dict[str, Any]:
-        """As JSON, together with what newer software wrote into the document that this was read from."""
+        """The model as JSON, with unknown fields of the document that it was read from."""
         named = {name: _as_document(getattr(self, name)) for name in type(self).model_fields}
         return self.model_dump(mode="json") | {n: value for n, value in named.items() if value is not None} | self.more
 
     @property
     def more(self) -> dict[str, Any]:
-        """What newer software wrote; nothing of a model that was not read from a document of a store."""
+        """Unknown fields of the document that the model was read from."""
         return dict(self.model_extra or {})
 
 
@@ -154,10 +154,10 @@ FIDELITIES = {
 
 
 class DynamicsRanges(RootModel[dict[Annotated[str, Field(pattern=NAME)], Range]]):
-    """What hidden parameters are drawn from, by their names (see `shared.hidden`).
+    """Ranges of hidden parameters, by name (see `shared.hidden`).
 
-    Those that are always drawn are always among them; others where they are named. An empty table, or none for the
-    former, gives the range that the parameter's own record proposes.
+    Parameters that are always drawn are always included; others are included if they are named. The default of a range
+    is that of the parameter's own record.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -185,7 +185,7 @@ class DynamicsRanges(RootModel[dict[Annotated[str, Field(pattern=NAME)], Range]]
 
     @property
     def extensions(self) -> list[tuple[Registry[Any], str]]:
-        """What of it packages may add: registry and name."""
+        """The things in it that packages may add: registry and name."""
         return [(HIDDEN_PARAMETERS, name) for name in self.added]
 
     def check_known(self) -> None:
@@ -204,7 +204,7 @@ def _proposed(parameter: HiddenParameter) -> Range:
 
 
 class RolloutConfig(StrictModel):
-    """What one rollout consists of."""
+    """The interactions of one rollout."""
 
     interactions: int = Field(32, ge=1, le=4096)
     """As published: 32 for each object and draw of hidden dynamics."""
@@ -223,7 +223,7 @@ class RolloutConfig(StrictModel):
 
 
 class CollectionConfig(StrictModel):
-    """How interactions are collected, apart from which objects, how many, and by whom."""
+    """How interactions are collected, except for the objects, their number and the workers."""
 
     primitive: Name | None = None
     """Instead of the task's own: push, push-left, push-up, pull, pull-left, pull-up, or what a package adds."""
@@ -277,7 +277,7 @@ def load_toml(path: Path) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`base` with the settings of `over` laid over it, table by table."""
+    """`base`, in which the settings of `over` replace its own, table by table."""
     merged = dict(base)
     for key, value in over.items():
         old = merged.get(key)

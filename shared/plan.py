@@ -87,12 +87,12 @@ class Setting(StrictModel):
 
     @property
     def dynamics(self) -> DynamicsRanges:
-        """What hidden parameters are drawn from; the task is looked up only where the setting leaves it to it."""
+        """Ranges of the hidden parameters: the setting's, or those of its task."""
         return self.collection.dynamics or self.terms.dynamics
 
     @property
     def terms(self) -> Terms:
-        """What holds, whether `collection` says it or leaves it to the task.
+        """The terms of `collection`, completed by the task.
 
         Raises:
             UsageError: there is no such task.
@@ -146,7 +146,7 @@ class Job:
 
 
 def missing_ranges(rollouts: int, done: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """What of [0, `rollouts`) no range in `done` covers, as half-open ranges in order; those of `done` may overlap."""
+    """Half-open ranges of [0, `rollouts`) that no range in `done` covers, ascending; ranges in `done` may overlap."""
     gaps, start = [], 0
     for low, high in sorted(done):
         gaps.append((start, min(low, rollouts)))
@@ -155,7 +155,7 @@ def missing_ranges(rollouts: int, done: Iterable[tuple[int, int]]) -> list[tuple
 
 
 def covered(ranges: Iterable[tuple[int, int]]) -> int:
-    """How many numbers lie in some half-open ranges, which may overlap."""
+    """How many numbers are in some half-open ranges, which may overlap."""
     count = end = 0
     for low, high in sorted(ranges):
         count += max(high - max(low, end), 0)
@@ -168,7 +168,7 @@ def missing_jobs(plan_key: str, rollouts: int, done: list[tuple[int, int]], per_
 
     Args:
         plan_key: the plan.
-        rollouts: how many are wanted in all.
+        rollouts: how many there should be in total.
         done: committed half-open ranges.
         per_shard: the most rollouts that one job may hold.
     """

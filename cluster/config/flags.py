@@ -101,7 +101,7 @@ def preset(name: str) -> dict[str, Any]:
 
 
 def layered(model: type[Model], preset_name: str | None, file: Path | None) -> Model:
-    """The model's defaults under a preset under a TOML file; what flags are then laid over.
+    """The settings of a model: its defaults, replaced by a preset, replaced by a TOML file; flags are applied later.
 
     Raises:
         UsageError: the preset or the file is missing, or has a setting that is unknown or not allowed.

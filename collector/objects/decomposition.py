@@ -37,10 +37,10 @@ SLACK = 0.1
 
 
 class Decomposer:
-    """Decomposes objects; a context that ends the process it may have started.
+    """Decomposes objects in a child process; a context manager that ends this process.
 
     Args:
-        cache: folder of the cache; made where missing.
+        cache: folder of the cache, created if missing.
 
     Example:
         >>> with Decomposer(cache_folder("pieces")) as decomposer:

@@ -24,17 +24,17 @@ class Critic(Protocol):
     def affordance(
         self, observation: Observation, points: NDArray[np.int64], history: Sequence[Interaction]
     ) -> Float32:
-        """The actionability of the points at some indices after a history, [Q], in [0, 1]."""
+        """Actionability of the points with these indices, given a history, [Q], in [0, 1]."""
         ...
 
     def predict(self, observation: Observation, actions: Sequence[Action], history: Sequence[Interaction]) -> Float32:
-        """The scores of actions after a history, [A], in [0, 1]."""
+        """Scores of actions, given a history, [A], in [0, 1]."""
         ...
 
     def predict_proposals(
         self, observation: Observation, proposals: Proposals, history: Sequence[Interaction]
     ) -> Tensor:
-        """The scores of proposals at one point after a history, [S], in [0, 1]."""
+        """Scores of proposals at one point, given a history, [S], in [0, 1]."""
         ...
 
 
@@ -44,7 +44,7 @@ def critic_names() -> list[CriticName]:
 
 
 def critic_named(name: CriticName, adapter: Adapter) -> Critic:
-    """The critic of a policy that is called `name`.
+    """The critic called `name`, with the networks of a policy.
 
     Raises:
         UsageError: there is none, or the policy's networks that it needs are not trained.

@@ -1,4 +1,4 @@
-"""Reading shards, which are hostile until their sizes, checksums, schemas and references have been checked."""
+"""Reading of shards, which are untrusted until sizes, checksums, schemas and references have been checked."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -50,7 +50,7 @@ _BATCH = 128
 
 
 def shard_folder(backend: StorageBackend, shard_id: str) -> Folder:
-    """Where a shard lies, or would."""
+    """The folder of a shard, which need not exist."""
     return Folder(backend, f"{SHARDS_FOLDER}/{shard_id}")
 
 
@@ -60,7 +60,7 @@ def is_committed(shard: Folder) -> bool:
 
 
 def named_jobs(backend: StorageBackend, plan_key: str | None = None) -> Iterator[Job]:
-    """The jobs that folders are called by, committed or not, in order of name."""
+    """The jobs of all shard folders, committed or not, sorted by name."""
     for name in backend.names(SHARDS_FOLDER):
         job = parse_shard_id(name)
         if job is not None and plan_key in (None, job.plan_key):
@@ -68,7 +68,7 @@ def named_jobs(backend: StorageBackend, plan_key: str | None = None) -> Iterator
 
 
 def committed_jobs(backend: StorageBackend, plan_key: str | None = None) -> list[Job]:
-    """The jobs whose shards are committed, in order of name, by the shards' names alone."""
+    """The jobs of all committed shards, sorted by name; no manifest is read."""
     found = []
     for jobs in _batches(named_jobs(backend, plan_key)):
         there = backend.exist([f"{SHARDS_FOLDER}/{job.shard_id}/{MANIFEST_FILE}" for job in jobs])
@@ -95,7 +95,7 @@ def read_manifest(shard: Folder) -> ShardManifest:
 
 
 def checked_manifest(shard: Folder, data: bytes) -> ShardManifest:
-    """The manifest of a shard, from hostile bytes.
+    """The manifest of a shard, from untrusted bytes.
 
     Raises:
         StoreError: it is damaged, foreign, of another schema version, or another shard's.
