@@ -23,15 +23,15 @@ class HiddenTarget(Protocol):
     """The object in a simulator that a parameter is applied to, before anything has moved."""
 
     def set_part_mass(self, mass: float) -> None:
-        """Give every movable part this mass, kg; its inertia is scaled along."""
+        """Set the mass of every movable part, kg, and scale its inertia."""
         ...
 
     def set_joint_friction(self, limit: float) -> None:
-        """Give every movable joint this Coulomb friction: N m if it turns, N if it slides."""
+        """Set the Coulomb friction of every movable joint: N m if it turns, N if it slides."""
         ...
 
     def set_surface_friction(self, coefficient: float) -> None:
-        """Give the surfaces of hand and object this friction coefficient."""
+        """Set the friction coefficient of the surfaces of hand and object."""
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""The objects of a folder: which can be used, which cannot and why, which suit a task, and how they are split.
+"""The objects of a folder: usable and refused ones, those that suit a task, and their split.
 
 A catalogue keeps a few words an object; geometry is read when it is wanted (`load`).
 """
@@ -29,7 +29,7 @@ _OBJECT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 @dataclass(frozen=True, slots=True)
 class PartSummary:
-    """What a task asks of a movable part."""
+    """The properties of a movable part that tasks use."""
 
     name: str
     """Semantic name; "" where semantics.txt is silent."""
@@ -54,7 +54,7 @@ class CatalogueEntry:
 
     @property
     def movable(self) -> int:
-        """How many parts can move."""
+        """Number of movable parts."""
         return sum(part.span > MIN_RANGE for part in self.parts)
 
 
@@ -81,10 +81,10 @@ def scan(path: Path, *object_lists: Path) -> Catalogue:
 
     Args:
         path: a folder of object folders, or one object's folder. Files and hidden folders in it are ignored.
-        object_lists: Where2Act lists, `<id> <category>` a line; where there are any, only their objects are looked at.
+        object_lists: Where2Act lists, `<id> <category>` a line; if given, only their objects are used.
 
     Raises:
-        UsageError: `path` or a list cannot be read, or there is no object at all.
+        UsageError: `path` or a list cannot be read, or there is no object.
     """
     folders = _object_folders(path)
     if object_lists:
@@ -127,7 +127,7 @@ def load(entry: CatalogueEntry) -> ArticulatedObject:
     """The object's geometry.
 
     Raises:
-        ObjectError: its files cannot be read, or are not those that were catalogued.
+        ObjectError: its files cannot be read, or have changed since the scan.
     """
     return _load(entry.folder, entry.tree, entry.ref)
 
@@ -138,10 +138,10 @@ def load_ref(path: Path, ref: ObjectRef, collision: Collision = "hulls") -> Arti
     Args:
         path: the folder.
         ref: which object.
-        collision: whether its collision meshes are taken as they are, or decomposed first.
+        collision: whether its collision meshes are used unchanged, or are decomposed first.
 
     Raises:
-        ObjectError: there is none, its files are not those that `ref` was made from, or it cannot be decomposed.
+        ObjectError: it is missing, its files have changed, or it cannot be decomposed.
     """
     loaded = _load(path / ref.id if reader_of(path) is None else path.resolve(), path, ref)
     if collision == "hulls":
@@ -156,7 +156,7 @@ def for_task(catalogue: Catalogue, task: Task) -> Catalogue:
 
 
 def of_categories(catalogue: Catalogue, categories: Collection[str]) -> Catalogue:
-    """The catalogue in which only objects of some categories are usable; of any where none is named."""
+    """The catalogue in which only objects of some categories are usable; all categories if none is given."""
 
     def reason(entry: CatalogueEntry) -> str | None:
         if not categories or entry.ref.category in categories:
@@ -167,7 +167,7 @@ def of_categories(catalogue: Catalogue, categories: Collection[str]) -> Catalogu
 
 
 def qualifying_parts(described: CatalogueEntry | ArticulatedObject, task: Task) -> tuple[int, ...]:
-    """The parts (1-based) that `task` may act on: visible, able to move, and of the kind that it names."""
+    """The parts (1-based) that `task` may act on: visible, movable, and with the task's part names."""
     if task.categories and described.ref.category not in task.categories:
         return ()
     parts = described.parts if isinstance(described, CatalogueEntry) else summaries(described)
@@ -177,12 +177,12 @@ def qualifying_parts(described: CatalogueEntry | ArticulatedObject, task: Task) 
 def split(refs: Iterable[ObjectRef], fractions: tuple[float, float, float], seed: int) -> ObjectSplit:
     """Split objects into train, validation and test, each category alike: a pure function of its arguments.
 
-    Each set whose fraction is not zero gets an object wherever there are as many objects as such sets.
+    Each set with a positive fraction gets an object if there are enough objects.
 
     Args:
         refs: in any order.
         fractions: of train, validation and test; non-negative, and they sum to 1.
-        seed: decides which objects go where.
+        seed: of the split.
 
     Raises:
         UsageError: the fractions are negative or do not sum to 1.
@@ -205,7 +205,7 @@ def split(refs: Iterable[ObjectRef], fractions: tuple[float, float, float], seed
 
 
 def summaries(described: ArticulatedObject) -> tuple[PartSummary, ...]:
-    """What tasks ask of each part of an object."""
+    """The properties of each part of an object that tasks use."""
     return tuple(
         PartSummary(body.part_name, body.joint.kind, body.joint.span, bool(body.visuals))
         for body in described.parts

@@ -149,7 +149,7 @@ class SapienEnvironment:
 
 
 def only_sapien(environment: SimEnvironment) -> SapienEnvironment:
-    """The environment, for what looks into SAPIEN's scene.
+    """The environment, for code that needs access to SAPIEN's scene.
 
     Raises:
         UsageError: it is of another simulator.
@@ -160,10 +160,10 @@ def only_sapien(environment: SimEnvironment) -> SapienEnvironment:
 
 
 def camera_for(target: ArticulatedObject, world_from_camera: Float, config: CameraConfig) -> Camera:
-    """The camera that the configuration names.
+    """The camera of the configuration.
 
     Raises:
-        UsageError: it cannot be had on this machine.
+        UsageError: this machine does not support it.
     """
     if config.renderer == "sapien":
         return SapienCamera(target, world_from_camera, config)
@@ -175,7 +175,7 @@ def draw_state(limits: Float, closed: bool, rng: np.random.Generator) -> Float:
 
     Args:
         limits: [parts, 2].
-        closed: whether the task wants every joint closed.
+        closed: whether the task requires every joint to be closed.
         rng: draws the state.
     """
     all_closed = rng.random() < CLOSED_SHARE
