@@ -166,11 +166,11 @@ class History(StrictModel):
 
 
 def read_history(path: Path) -> History:
-    """Read a history, trusting nothing.
+    """Read an untrusted history.
 
     Raises:
-        UsageError: it is no history, with the first thing that is wrong.
-        StoreError: it is no regular file, or too large.
+        UsageError: it is not a valid history; the message has the first error.
+        StoreError: it is not a regular file, or too large.
     """
     if os.path.exists(path) and not os.path.isfile(path):  # noqa: PTH110, PTH113 - of a name too long pathlib raises.
         raise UsageError(f"{path}: a folder, pipe or device, and no file; name a history, or a file that is to be one")
@@ -184,16 +184,16 @@ def read_history(path: Path) -> History:
 
 
 def parse_json(model: type[Model], data: bytes, source: str, remedy: str) -> Model:
-    """Read a document of JSON, trusting nothing.
+    """Parse an untrusted JSON document.
 
     Args:
-        model: what it holds.
+        model: of its contents.
         data: in UTF-8, with or without a byte order mark.
-        source: what a message begins with, such as the file.
-        remedy: what a message ends with: what to write instead.
+        source: start of messages, such as the file.
+        remedy: end of messages: what to write instead.
 
     Raises:
-        UsageError: it is none, with the first thing that is wrong.
+        UsageError: it is not valid; the message has the first error.
     """
     try:
         text = without_mark(data)
@@ -215,10 +215,10 @@ def _without_doubles(pairs: list[tuple[str, object]]) -> None:
 
 
 def write_history(path: Path, history: History) -> None:
-    """Write a history; a reader finds the old one or the new.
+    """Write a history atomically.
 
     Raises:
-        UsageError: its folder cannot be written to.
+        UsageError: the folder is not writable.
     """
     try:
         write_atomically(path, history.model_dump_json(indent=2).encode() + b"\n")

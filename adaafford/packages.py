@@ -1,4 +1,4 @@
-"""Our five packages have short names, which a user's own folder may have, too: then Python takes that one for ours.
+"""Our five packages have short names. If a user's folder has the same name, Python may import it instead of ours.
 
 So it is seen whether all are from one place before the first is used. Nothing of ours is imported here.
 """

@@ -1,4 +1,4 @@
-"""Scans: point clouds of a real object from a file or an array, as observations that a policy understands.
+"""Scans: point clouds of a real object from a file or an array, converted to observations.
 
 A scan has a frame of its own, in metres: a camera's, or a robot's. `ScanFrame` says where that frame's *up* points
 (against gravity), where the camera stood in it, and which of its points is the object's middle; the world frame of
@@ -61,13 +61,13 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """A cloud as it was taken, without the points that were not measured.
+    """A scanned cloud without unmeasured points.
 
     Attributes:
         points: [M, 3], metres, in the scan's frame.
-        normals: [M, 3], of any length and sign, 0 0 0 where one is to be estimated; None: all of them.
+        normals: [M, 3], of any length and sign; 0 0 0 for a normal that is estimated; None: all are estimated.
         movable: [M], whether the policy may act on the point; None: everywhere.
-        camera: where the camera stood, if the file says.
+        camera: camera position, if the file has it.
         rows: [M], where the points stand in the file or array; None: there are no others.
         missing: how many points were not measured.
     """
@@ -81,7 +81,7 @@ class Scan:
 
 
 class ScanFrame(StrictModel):
-    """How scans of one object lie in the world."""
+    """The transformation between the scans of one object and the world."""
 
     up: Vector = (0.0, 0.0, 1.0)
     """Against gravity, of any length."""
@@ -193,14 +193,14 @@ def checked_scan(
     camera: ArrayLike | None = None,
     source: str = "the cloud",
 ) -> Scan:
-    """A scan of arrays from anywhere.
+    """A scan from untrusted arrays.
 
     Args:
         points: [M, 3]; those that are 0 0 0 or not finite are left out, as depth cameras mark what they miss.
         normals: [M, 3]; those that are 0 0 0 or not finite are to be estimated.
         movable: [M], of 0 and 1, or false and true.
         camera: [3].
-        source: what messages call it.
+        source: its name in messages.
 
     Raises:
         UsageError: shapes do not agree, or values are none that are allowed, or too few or too many points are left,
@@ -243,7 +243,7 @@ def checked_scan(
 
 
 def missing_points(scan: Scan) -> str | None:
-    """What to tell a user where a large share of a scan was not measured."""
+    """A warning if a large share of a scan was not measured."""
     total = len(scan.points) + scan.missing
     if scan.missing <= _MISSING_SHARE * total:
         return None
@@ -272,12 +272,12 @@ def doubtful_up(scan: Scan, frame: ScanFrame) -> str | None:
 
 
 def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = POINTS) -> Observation:
-    """What a policy is shown of a scan, thinned and rounded as in training.
+    """The observation of a scan, subsampled and rounded as in training.
 
     Args:
-        scan: as it was taken.
-        frame: how it lies in the world.
-        seed: of what is drawn where there are many points.
+        scan: the scan.
+        frame: its transformation to the world.
+        seed: of the random subsampling.
         points: N; as many as the policy was trained with.
 
     Raises:

@@ -120,11 +120,11 @@ class Session:
         self._observations: dict[tuple[str, ScanFrame], Observation] = {}
 
     def step(self, cloud: Path, outcome: TriedOutcome | None = None) -> Step:
-        """Take in what happened, and say what to do next.
+        """Read a scan and the last outcome, and propose the next action.
 
         Args:
-            cloud: a scan of the object as it stands.
-            outcome: of what the last step said; None if it was not done.
+            cloud: a scan of the object in its present state.
+            outcome: of the last proposal; None if it was not executed.
 
         Raises:
             UsageError: a file cannot be used, with the reason.

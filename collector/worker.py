@@ -124,7 +124,7 @@ class Worker:
             return self._objects.load(object_of(plan, index), plan.setting.collection.collision)
 
     def _proposer(self, plan: Plan, name: str, rng: np.random.Generator, version: int) -> Proposer:
-        """The proposer called `name` with a policy version."""
+        """The proposer called `name`, of a policy version."""
         if name == RandomProposer.name:
             return RandomProposer(rng, plan.setting.terms.edge_share)
         if name in PROPOSERS.names() and not needs_policy(name):

@@ -1,4 +1,4 @@
-"""What a campaign will cost, before it is begun: interactions, core-hours and bytes by stage, from measured rates.
+"""The cost estimate of a campaign: interactions, core-hours and bytes by stage, from measured rates.
 
 Nothing is simulated and nothing is written. The rates are of one core of the machine that `RATES` names, unloaded;
 other machines differ by a factor, the shares of the stages hardly.
@@ -76,7 +76,7 @@ LEFT_BY_TRAINING = 5
 
 @dataclass(frozen=True, slots=True)
 class StageCost:
-    """What one stage will cost."""
+    """The estimated cost of one stage."""
 
     stage: str
     interactions: int
@@ -86,11 +86,11 @@ class StageCost:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What a campaign will cost.
+    """The estimated cost of a campaign.
 
     Attributes:
-        task: which it is.
-        objects: how many are trained on, validate and are tested on.
+        task: its name.
+        objects: number of training, validation and test objects.
         stages: in order.
     """
 
@@ -172,7 +172,7 @@ class _Costs:
         told = self.config.evaluation
         methods = [METHODS.get(name) for name in told.methods]
         tries = [max(method.budgets(told.budgets)) if method.tries else 0 for method in methods]
-        # With interactions, two actions: from the state that they left, and from the one in which they began.
+        # Twice where there are tries: where these left the object, and where they began.
         chosen = sum(len(method.budgets(told.budgets)) * (2 if method.tries else 1) for method in methods)
         by_policy = chosen + sum(n for n, m in zip(tries, methods, strict=True) if m.tries not in (None, RANDOM))
         interactions = rollouts * (told.queries + sum(tries) + chosen)
@@ -269,7 +269,7 @@ class _Costs:
 
 
 def multiply_adds(network: NetworkConfig, points: int) -> float:
-    """Multiplications that PointNet++ makes of a cloud, forward."""
+    """Multiplications of a forward pass of PointNet++ over one cloud."""
     sizes = [points, *(min(count, points) for count in network.centres)]
     total, width = 0, 0
     widths = [0]

@@ -113,7 +113,7 @@ class RunFolder:
 
     @property
     def adopted(self) -> Path:
-        """The policy that the run went on from, if it did (`cluster.runs.warm_start`)."""
+        """The policy that the run started from, if there is one (`cluster.runs.warm_start`)."""
         return self.training("adopted")
 
     @property
@@ -122,30 +122,30 @@ class RunFolder:
         return self.path / "report.html"
 
     def are_novel(self, tested: Iterable[ObjectRef]) -> bool:
-        """Whether objects are of categories that nothing was trained on; of an adopted policy nobody knows."""
+        """Whether the objects have only categories that were not trained on; unknown for an adopted policy."""
         used = self.objects_used()
         learned_from = (ref.category for ref in (*used.train, *used.validation))
         return not self.adopted.is_dir() and {ref.category for ref in tested}.isdisjoint(learned_from)
 
     def training(self, stage: str) -> Path:
-        """What a training stage leaves."""
+        """The folder of a training stage."""
         return self.trainings / stage
 
     @property
     def trainings(self) -> Path:
-        """What all training stages leave."""
+        """The folder of all training stages."""
         return self.path / "training"
 
     @property
     def evaluations(self) -> Path:
-        """What `adaafford evaluate` leaves, a folder each."""
+        """The folder of the evaluations by `adaafford evaluate`."""
         return self.path / "evaluations"
 
     def objects_folder(self) -> Path:
-        """Where the run's objects lie: in the run, or where its user said last.
+        """The folder of the run's objects: in the run, or the last one that the user gave.
 
         Raises:
-            UsageError: they are not there any more.
+            UsageError: it does not exist any more.
         """
         named = _read_config(self).get("objects")
         folder = self.generated_objects.resolve() if named is None else Path(str(named))
@@ -159,24 +159,24 @@ class RunFolder:
         )
 
     def generates_objects(self) -> bool:
-        """Whether its objects are procedural ones of its own."""
+        """Whether its objects are procedural."""
         return _read_config(self).get("objects") is None
 
     def begun_with(self) -> dict[str, str]:
-        """Versions of the software that the run was begun with."""
+        """Software versions at the start of the run."""
         known = read_json(self.config).get("software")
         return {str(name): str(version) for name, version in known.items()} if isinstance(known, dict) else {}
 
     def objects_used(self) -> ObjectsUsed:
-        """What objects.json says."""
+        """The contents of objects.json."""
         return parse(ObjectsUsed, read_json(self.objects_file), str(self.objects_file))
 
 
 def begin(path: Path, config: CampaignConfig) -> RunFolder:
-    """Make the folder of a new run, or find the one that was begun with the same configuration.
+    """Create the folder of a new run, or open a run with the same configuration.
 
     Raises:
-        UsageError: the folder holds another run, or anything else.
+        UsageError: the folder has another run or other files.
     """
     run = RunFolder(path)
     settings = config.model_dump(mode="json")

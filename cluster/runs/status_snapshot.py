@@ -68,7 +68,7 @@ class StoreSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class TrainingSnapshot:
-    """The last line of metrics that a training wrote.
+    """The last line of a training's metrics.
 
     Attributes:
         stage: folder of the stage.
@@ -85,15 +85,15 @@ class TrainingSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class StatusSnapshot:
-    """How something stands.
+    """The status of a run, a store or a learner.
 
     Attributes:
         what: "run", "store" or "learner".
-        where: as it was named.
-        stages_done: of a run, in the order they ended.
-        stage: of a run, the one under way; None if there is none.
-        stage_s: seconds that it has taken, over all attempts.
-        stores: of a run, its two; of a store, itself.
+        where: the given folder or URL.
+        stages_done: finished stages of a run, in the order of their ends.
+        stage: the running stage of a run; None if there is none.
+        stage_s: seconds of that stage, over all attempts.
+        stores: the two of a run; or the store itself.
         training: of a run or a learner; None before the first validation.
     """
 
@@ -107,7 +107,7 @@ class StatusSnapshot:
 
 
 def snapshot_of(where: str, now: float | None = None) -> StatusSnapshot:
-    """How a run, a store or a learner stands.
+    """The status of a run, a store or a learner.
 
     Args:
         where: its folder, or the URL of a store.

@@ -1,4 +1,4 @@
-"""A policy that a campaign goes on from, instead of training one from nothing: fine-tuning on other objects.
+"""The warm start of a campaign from an existing policy, for fine-tuning on other objects.
 
 training/adopted/ of such a run is what the stages prior, aap-1 and aip-1 leave in others: a policy, the oracle that
 taught it, where there was one, and done.json, which says what objects it has seen.
