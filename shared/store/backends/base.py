@@ -178,14 +178,14 @@ def backend_of(where: str | Path) -> StorageBackend:
         UsageError: the URL is not allowed, or credentials are missing.
     """
     if is_url(where):
-        from shared.store.backends.s3 import BucketPlace
+        from shared.store.backends.s3 import S3Backend
 
-        return BucketPlace.of(str(where))
+        return S3Backend.of(str(where))
     if isinstance(where, Path) and where.parts[:1] == ("s3:",):
         raise UsageError(f"{where}: a path cannot hold the two slashes of a URL; give s3://BUCKET/PREFIX as text")
-    from shared.store.backends.local import DiskPlace
+    from shared.store.backends.local import LocalBackend
 
-    return DiskPlace(Path(where))
+    return LocalBackend(Path(where))
 
 
 def folder_beside(where: str, suffix: str) -> Path:

@@ -28,7 +28,7 @@ _LOCK_WAIT_S = 60.0
 """Locks are held for milliseconds; one that lasts longer means a hung disk."""
 
 
-class DiskPlace:
+class LocalBackend:
     """See `shared.store.backends.base.StorageBackend`."""
 
     writes_in_place = False
