@@ -1,6 +1,6 @@
-"""Affordance that adapts to one articulated object after a few tries: the public face.
+"""Affordance that adapts to one articulated object after a few interactions: the Python interface.
 
-A robot's author implements `Environment` over a camera and an arm, and lets the policy choose:
+For a robot, implement `Environment` with its camera and arm, and let the policy choose the actions:
 
 >>> adapter = Adapter(load_policy("pull-closed-door"))
 >>> proposer, history = AipProposer(adapter, numpy.random.default_rng(1), budget=4), []
@@ -8,9 +8,9 @@ A robot's author implements `Environment` over a camera and an arm, and lets the
 ...     history.append(Interaction(observation, action, robot.execute(action)))
 >>> heat = adapter.affordance(robot.observe(), history)      # [N], where the part can be moved
 
-`open_store` reads what was collected: tables, clouds, and by `InteractionDataset` samples for PyTorch.
-`collect` and `train` do what the commands of these names do; `simulated` gives simulated objects to try a policy on.
-Collecting and simulating need `pip install 'adaafford[collect]'`; nothing of that is imported before they are used.
+`open_store` reads collected data: tables, clouds, and by `InteractionDataset` samples for PyTorch.
+`collect` and `train` are the commands of these names; `simulated` gives simulated objects for tests of a policy.
+Collection and simulation need `pip install 'adaafford[collect]'`, and import these packages only when they are used.
 """
 
 from importlib import import_module

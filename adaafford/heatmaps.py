@@ -13,7 +13,7 @@ from shared.types import Float, Float32
 
 
 def write_heatmap(path: Path, points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> None:
-    """Write the format that the name ends in.
+    """Write a heatmap in the format given by the suffix of the file.
 
     Args:
         path: .ply (coloured, with a property `affordance`), .npz (`points`, `affordance`, `indices`) or .html.
@@ -22,7 +22,7 @@ def write_heatmap(path: Path, points: Float, affordance: Float32, indices: NDArr
         indices: [N], which points of the scan these are.
 
     Raises:
-        UsageError: the name ends otherwise, or its folder cannot be written to.
+        UsageError: the suffix is not allowed, or the folder cannot be written to.
     """
     writer = heatmap_writer(path)
     try:

@@ -1,4 +1,4 @@
-"""Histories: what was tried on one object so far, as a JSON file that people and robots may write.
+"""Histories: the interactions with one object so far, as a JSON file that people and robots may write.
 
 {
   "format": "adaafford-history", "schema_version": 1,
@@ -9,8 +9,8 @@
   ]
 }
 
-Everything is in the frame of the clouds, in metres and radians; `cloud` names a file beside the history or below. An
-interaction without an outcome is a proposal that nobody has tried yet.
+Everything is in the frame of the clouds, in metres and radians; `cloud` is a file in the folder of the history or
+below. An interaction without an outcome is a proposal that was not executed yet.
 """
 
 import json
@@ -60,20 +60,20 @@ ScanName = Annotated[str, AfterValidator(scan_name)]
 
 
 class TriedOutcome(StrictModel):
-    """What came of a try."""
+    """The outcome of an interaction."""
 
     motion: float = Field(ge=0, le=100)
     """How far the part moved: rad if it turns, m if it slides; 0 for nothing, or for a grasp that slipped."""
     success: bool | None = None
-    """Whether it moved as intended (a pull pulled); where nothing is said, whether it moved by more than 0.01."""
+    """Whether it moved as intended (a pull pulled); default: whether it moved by more than 0.01."""
     kind: OutcomeKind = OutcomeKind.UNKNOWN
-    """How the try ended; of what a simulator tells, a robot may know "ok", "no-contact" or "no-grasp"."""
+    """How the interaction ended; of these kinds, a robot usually knows only "ok", "no-contact" and "no-grasp"."""
     grasp_width: float | None = Field(None, ge=0, le=MAX_GRASP_WIDTH)
-    """How far the fingers stayed open together when they had closed, m; None: not measured, or nothing closed."""
+    """Opening of the two fingers together after they closed, m; None: not measured, or nothing closed."""
 
     @property
     def outcome(self) -> Outcome:
-        """As policies are told it."""
+        """The outcome in the form that policies read."""
         moved = self.kind in (OutcomeKind.OK, OutcomeKind.UNKNOWN) and self.motion > SUCCESS_MOTION
         success = moved if self.success is None else self.success
         width = math.nan if self.grasp_width is None else self.grasp_width
@@ -81,20 +81,20 @@ class TriedOutcome(StrictModel):
 
 
 class TriedInteraction(StrictModel):
-    """One try, or a proposal for one."""
+    """One interaction, or a proposal for one."""
 
     cloud: ScanName
-    """The scan that was taken before it: a path relative to the history, which does not lead out of its folder."""
+    """The scan before the interaction: a path relative to the history, inside its folder."""
     cloud_sha256: str | None = Field(None, pattern=r"^[0-9a-f]{64}$")
-    """Of that file: a scan that was written over since is not what the try was made on. Unchecked where left out."""
+    """The hash of that file, which reveals a scan that was overwritten; None: not checked."""
     point: Vector
-    """Where the fingertips go."""
+    """The target of the fingertips."""
     approach: Vector
-    """The way the hand moves when it approaches."""
+    """The approach direction of the hand."""
     forward: Vector
-    """The hand's forward direction, which says how it is rolled (see docs/robot.md)."""
+    """The hand's forward direction, which defines its roll (see docs/robot.md)."""
     outcome: TriedOutcome | None = None
-    """None until it is tried."""
+    """None until the interaction was executed."""
 
     @field_validator("cloud")
     @classmethod
@@ -115,22 +115,22 @@ class History(StrictModel):
 
     @property
     def pending(self) -> TriedInteraction | None:
-        """The proposal that waits for its outcome."""
+        """The proposal without an outcome, if there is one."""
         return self.interactions[-1] if self.interactions and self.interactions[-1].outcome is None else None
 
     @property
     def tried(self) -> tuple[TriedInteraction, ...]:
-        """The tries that came to an end."""
+        """The interactions with an outcome."""
         return tuple(each for each in self.interactions if each.outcome is not None)
 
     def proposing(self, action: Action, cloud: str, cloud_sha256: str) -> "History":
-        """This history with a proposal in its end, in the place of one that nobody tried.
+        """This history with a proposal at its end; it replaces one that was not executed.
 
         Raises:
-            UsageError: it is full.
+            UsageError: the history is full.
         """
         if len(self.tried) >= MAX_TRIES:
-            raise UsageError(f"the history holds {MAX_TRIES} tries, which is all that it may; begin another")
+            raise UsageError(f"the history holds {MAX_TRIES} interactions, which is the maximum; begin another")
         frame = self.frame
         proposal = TriedInteraction(
             cloud=cloud,
@@ -153,17 +153,17 @@ class History(StrictModel):
         return self.model_copy(update={"interactions": (*self.tried, last)})
 
     def interactions_with(self, observe: Callable[[TriedInteraction], Observation]) -> list[Interaction]:
-        """The tries as a policy is told them.
+        """The interactions in the form that policies read.
 
         Args:
-            observe: gives the observation that a try was made on.
+            observe: gives the observation before an interaction.
 
         Raises:
-            UsageError: a cloud cannot be read, or a try does not lie on its cloud.
+            UsageError: a cloud cannot be read, or an interaction point is not on its cloud.
         """
         found = []
         for each in self.tried:
-            assert each.outcome is not None, "a try has an outcome"
+            assert each.outcome is not None, "an interaction has an outcome"
             observation = observe(each)
             action = action_at(observation, self.frame, each.point, each.approach, each.forward)
             found.append(Interaction(observation, action, each.outcome.outcome))
@@ -171,11 +171,11 @@ class History(StrictModel):
 
 
 def read_history(path: Path) -> History:
-    """Read a history, trusting nothing.
+    """Read an untrusted history.
 
     Raises:
-        UsageError: it is no history, with the first thing that is wrong.
-        StoreError: it is no regular file, or too large.
+        UsageError: it is not a valid history; the message has the first error.
+        StoreError: it is not a regular file, or too large.
     """
     if os.path.exists(path) and not os.path.isfile(path):  # noqa: PTH110, PTH113 - of a name too long pathlib raises.
         raise UsageError(f"{path}: a folder, pipe or device, and no file; name a history, or a file that is to be one")
@@ -189,16 +189,16 @@ def read_history(path: Path) -> History:
 
 
 def parse_json(model: type[Model], data: bytes, source: str, remedy: str) -> Model:
-    """Read a document of JSON, trusting nothing.
+    """Parse an untrusted JSON document.
 
     Args:
-        model: what it holds.
+        model: of its contents.
         data: in UTF-8, with or without a byte order mark.
-        source: what a message begins with, such as the file.
-        remedy: what a message ends with: what to write instead.
+        source: start of messages, such as the file.
+        remedy: end of messages: what to write instead.
 
     Raises:
-        UsageError: it is none, with the first thing that is wrong.
+        UsageError: it is not valid; the message has the first error.
     """
     try:
         text = without_mark(data)
@@ -216,14 +216,14 @@ def parse_json(model: type[Model], data: bytes, source: str, remedy: str) -> Mod
 
 def _without_doubles(pairs: list[tuple[str, object]]) -> None:
     if (name := named_twice(pairs)) is not None:
-        raise ValueError(f"the name '{shown([name])}' stands twice")
+        raise ValueError(f"the name '{shown([name])}' occurs twice")
 
 
 def write_history(path: Path, history: History) -> None:
-    """Write a history; a reader finds the old one or the new.
+    """Write a history atomically.
 
     Raises:
-        UsageError: its folder cannot be written to.
+        UsageError: the folder is not writable.
     """
     try:
         write_atomically(path, history.model_dump_json(indent=2).encode() + b"\n")

@@ -1,4 +1,4 @@
-"""NPZ, NumPy's archive of arrays: read without pickle, and without believing what it says of its size."""
+"""NPZ, NumPy's archive of arrays: read without pickle, with checked sizes."""
 
 import io
 import struct

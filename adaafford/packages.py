@@ -1,4 +1,4 @@
-"""Our five packages have short names, which a user's own folder may have, too: then Python takes that one for ours.
+"""Our five packages have short names. If a user's folder has the same name, Python may import it instead of ours.
 
 So it is seen whether all are from one place before the first is used. Nothing of ours is imported here.
 """
@@ -18,7 +18,7 @@ class ShadowedError(ImportError):
 
 
 def require_own_packages() -> None:
-    """See that none of our packages is shadowed by something else of its name.
+    """Check that none of our packages is shadowed by something else of its name.
 
     Raises:
         ShadowedError: one is; the message names it and says what to do. Uncaught, it shows as one line.

@@ -1,4 +1,4 @@
-"""Policies by name or place: those that the package brings, a folder of a policy's files, or a finished run.
+"""Loading of policies: bundled ones by name, a folder of a policy's files, or a finished run.
 
 A policy of the package lies in adaafford/pretrained/<name>/: weights.safetensors in half precision, policy.json, and
 README.md, its model card (`adaafford export-policy` makes all three).
@@ -16,15 +16,15 @@ CARD_FILE = "README.md"
 
 
 def pretrained_names() -> list[str]:
-    """The policies that the package brings."""
+    """The names of the bundled policies."""
     return sorted(path.parent.name for path in PRETRAINED_FOLDER.glob(f"*/{POLICY_FILE}"))
 
 
 def only_pretrained() -> str:
-    """The one policy that the package brings.
+    """The name of the only bundled policy.
 
     Raises:
-        UsageError: it brings none, or several.
+        UsageError: there is none, or there are several.
     """
     names = pretrained_names()
     if len(names) != 1:
@@ -33,7 +33,7 @@ def only_pretrained() -> str:
 
 
 def load_policy(source: str | Path) -> Policy:
-    """The policy of a name, such as "pull-closed-door", or of a place.
+    """Load a policy by a name, such as "pull-closed-door", or from a path.
 
     Args:
         source: a name of `pretrained_names`, a folder that holds a policy's two files, one of these files, or a run

@@ -1,4 +1,4 @@
-"""Scans: point clouds of a real object from a file or an array, as observations that a policy understands.
+"""Scans: point clouds of a real object from a file or an array, converted to observations.
 
 A scan has a frame of its own, in metres: a camera's, or a robot's. `ScanFrame` says where that frame's *up* points
 (against gravity), where the camera stood in it, and which of its points is the object's middle; the world frame of
@@ -63,13 +63,13 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """A cloud as it was taken, without the points that were not measured.
+    """A scanned cloud without unmeasured points.
 
     Attributes:
         points: [M, 3], metres, in the scan's frame.
-        normals: [M, 3], of any length and sign, 0 0 0 where one is to be estimated; None: all of them.
+        normals: [M, 3], of any length and sign; 0 0 0 for a normal that is estimated; None: all are estimated.
         movable: [M], whether the policy may act on the point; None: everywhere.
-        camera: where the camera stood, if the file says.
+        camera: camera position, if the file has it.
         rows: [M], where the points stand in the file or array; None: there are no others.
         missing: how many points were not measured.
     """
@@ -83,7 +83,7 @@ class Scan:
 
 
 class ScanFrame(StrictModel):
-    """How scans of one object lie in the world."""
+    """The transformation between the scans of one object and the world."""
 
     up: Vector = (0.0, 0.0, 1.0)
     """Against gravity, of any length."""
@@ -128,7 +128,7 @@ class ScanFrame(StrictModel):
         place = self.to_world([self.camera])[0]
         distance = float(np.linalg.norm(place))
         if distance < 1e-3:
-            raise UsageError("the camera stands in the middle of the cloud; say where it stood in the cloud's frame")
+            raise UsageError("the camera is in the middle of the cloud; give its position in the cloud's frame")
         elevation = np.clip(np.rad2deg(np.arcsin(place[2] / distance)), -89.9, 89.9)
         return camera_pose(float(np.rad2deg(np.arctan2(place[1], place[0]))), float(elevation), distance)
 
@@ -151,13 +151,13 @@ class ScanFrame(StrictModel):
 def read_scan(path: Path) -> Scan:
     """Read a cloud from a PLY, NPZ or PCD file.
 
-    PLY and PCD: x y z, and, where they are there, normals (nx ny nz or normal_x ...) and `movable`. NPZ: `points`, and
+    PLY and PCD: x y z, and optionally normals (nx ny nz or normal_x ...) and `movable`. NPZ: `points`, and
     optionally `normals`, `movable` and `camera`. Points that are 0 0 0 or not finite were not measured: they are left
     out. Normals of this kind are estimated.
 
     Raises:
-        UsageError: it is no such file, or holds no cloud of finite points in metres.
-        StoreError: it cannot be read, or is too large.
+        UsageError: the file has another format, or no cloud of finite points in metres.
+        StoreError: the file cannot be read, or is too large.
     """
     return parse_scan(read_scan_file(path), path)
 
@@ -195,14 +195,14 @@ def checked_scan(
     camera: ArrayLike | None = None,
     source: str = "the cloud",
 ) -> Scan:
-    """A scan of arrays from anywhere.
+    """A scan from untrusted arrays.
 
     Args:
         points: [M, 3]; those that are 0 0 0 or not finite are left out, as depth cameras mark what they miss.
         normals: [M, 3]; those that are 0 0 0 or not finite are to be estimated.
         movable: [M], of 0 and 1, or false and true.
         camera: [3].
-        source: what messages call it.
+        source: its name in messages.
 
     Raises:
         UsageError: shapes do not agree, or values are none that are allowed, or too few or too many points are left,
@@ -245,7 +245,7 @@ def checked_scan(
 
 
 def missing_points(scan: Scan) -> str | None:
-    """What to tell a user where a large share of a scan was not measured."""
+    """A warning if a large share of a scan was not measured."""
     total = len(scan.points) + scan.missing
     if scan.missing <= _MISSING_SHARE * total:
         return None
@@ -268,18 +268,18 @@ def doubtful_up(scan: Scan, frame: ScanFrame) -> str | None:
     up = " ".join(f"{value:g}" for value in frame.up)
     axes, probable = ("y down, z forward", "0 -1 0") if sight > 0 else ("y up, z backward", "0 1 0")
     return (
-        f"with up {up} the camera stands {abs(elevation):.0f} deg {side} the object; in a camera's own frame (x right, "
+        f"with up {up} the camera is {abs(elevation):.0f} deg {side} the object; in a camera's own frame (x right, "
         f"{axes}) up is probably {probable}"
     )
 
 
 def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = POINTS) -> Observation:
-    """What a policy is shown of a scan, thinned and rounded as in training.
+    """The observation of a scan, subsampled and rounded as in training.
 
     Args:
-        scan: as it was taken.
-        frame: how it lies in the world.
-        seed: of what is drawn where there are many points.
+        scan: the scan.
+        frame: its transformation to the world.
+        seed: of the random subsampling.
         points: N; as many as the policy was trained with.
 
     Raises:
@@ -289,7 +289,7 @@ def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = PO
     kept = furthest_first(scan.points, points, max(CANDIDATES, points), rng)
     places = frame.to_world(scan.points[kept])
     if np.abs(places).max() > 2 * MAX_EXTENT_M:
-        raise UsageError("the cloud lies far from the origin of its frame; all scans of a history share one frame")
+        raise UsageError("the cloud is far from the origin of its frame; all scans of a history share one frame")
     normals = np.zeros_like(places) if scan.normals is None else scan.normals[kept] @ frame.world_from_scan.T
     unknown = np.linalg.norm(normals, axis=1) <= _MIN_NORMAL
     if unknown.any():

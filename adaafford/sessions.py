@@ -1,7 +1,7 @@
-"""A session: the loop of test time over files, for a robot that shares no process with the policy.
+"""A session: the test-time loop over files, for a robot whose program runs in another process.
 
-Each step takes a scan and, if something was tried since the last one, its outcome; it leaves the proposal in the
-history and the adapted affordance in a heatmap. A session that is ended and begun again goes on from the history alone.
+Each step reads a scan and the outcome of the last proposal, if it was executed. It writes the next proposal to the
+history and the adapted affordance to a heatmap. A session can be ended and continued from its history.
 """
 
 import hashlib
@@ -44,8 +44,8 @@ class SessionFiles:
     """What a session reads and writes.
 
     Attributes:
-        history: the history, which need not be there yet; clouds lie in its folder or below.
-        heatmap: where the adapted affordance goes (see `adaafford.heatmaps`); None: nowhere.
+        history: the history, created if missing; clouds are in its folder or below.
+        heatmap: the file for the adapted affordance (see `adaafford.heatmaps`); None: none is written.
     """
 
     history: Path
@@ -53,35 +53,35 @@ class SessionFiles:
 
 
 class Step(StrictModel):
-    """What a session answers; everything in the scan's frame."""
+    """The answer of a session, in the frame of the scan."""
 
     do: Literal["try", "act"]
-    """"try" a proposal of AIP, which should teach most; "act": enough is known, this should succeed."""
+    """"try": a proposal of AIP, to learn more about the object; "act": the action that should succeed."""
     tries: int
-    """How many tries the policy knows."""
+    """Number of interactions with an outcome in the history."""
     point: Vector
     approach: Vector
     forward: Vector
     belief: float
-    """The probability of success that the policy gives the action."""
+    """The predicted success probability of the action."""
     seconds: float
-    """How long the step took."""
+    """Duration of the step."""
 
 
 class Request(StrictModel):
-    """One line that a robot writes to a session that follows it."""
+    """One input line of a session with `--follow`."""
 
     cloud: ScanName
-    """A scan of the object as it stands."""
+    """A scan of the object in its present state."""
     outcome: TriedOutcome | None = None
-    """Of what the last step said; None if it was not done."""
+    """The outcome of the last proposal; None if it was not executed."""
 
     @classmethod
     def read(cls, line: bytes) -> "Request":
-        """Read a line, trusting nothing.
+        """Parse an untrusted line.
 
         Raises:
-            UsageError: it is no request.
+            UsageError: it is not a request.
         """
         return parse_json(cls, line, "", 'write {"cloud": "scan.ply"}')
 
@@ -92,12 +92,12 @@ class Session:
     Args:
         policy: with prior, AAP and AIP trained.
         files: what is read and written.
-        budget: how many tries AIP may propose.
-        seed: of what is drawn; a step that is asked for again is the same.
-        up: against gravity, in the frame of the scans; the history's where there is one, else 0 0 1.
-        camera: where the camera stood, likewise; else what the first scan says, else 0 0 0.
-        points: how many of a scan the policy is shown.
-        tell: is given lines on what looks wrong in a scan or its frame, which do not end the session.
+        budget: how many interactions AIP may propose.
+        seed: of the random draws; a repeated step gives the same answer.
+        up: direction against gravity, in the frame of the scans; default: the history's, otherwise 0 0 1.
+        camera: camera position, in the same frame; default: that of the first scan, otherwise 0 0 0.
+        points: how many points of a scan the policy receives.
+        tell: receives warnings about a scan or its frame.
     """
 
     def __init__(
@@ -120,11 +120,11 @@ class Session:
         self._observations: dict[tuple[str, ScanFrame], Observation] = {}
 
     def step(self, cloud: Path, outcome: TriedOutcome | None = None) -> Step:
-        """Take in what happened, and say what to do next.
+        """Read a scan and the last outcome, and propose the next action.
 
         Args:
-            cloud: a scan of the object as it stands.
-            outcome: of what the last step said; None if it was not done.
+            cloud: a scan of the object in its present state.
+            outcome: of the last proposal; None if it was not executed.
 
         Raises:
             UsageError: a file cannot be used, with the reason.
@@ -174,7 +174,7 @@ class Session:
             return history
         if not self._files.history.parent.is_dir():
             raise UsageError(
-                f"{self._files.history.parent}: there is no such folder; make it, and put the clouds there"
+                f"{self._files.history.parent}: there is no such folder; create it, and put the clouds there"
             )
         path, data, sha256 = self._file(name)
         scan = parse_scan(data, path)
@@ -192,7 +192,7 @@ class Session:
             name = Path(os.path.realpath(cloud)).relative_to(folder).as_posix()
         except ValueError:
             raise UsageError(
-                f"{cloud}: does not lie beside the history or below; put it into {folder}, so that both stay together"
+                f"{cloud}: is not in the folder of the history or below; put it into {folder} to keep both together"
             ) from None
         try:
             return scan_name(name)
@@ -206,7 +206,7 @@ class Session:
         """
         path, data, sha256 = self._file(name)
         if wanted not in (None, sha256):
-            raise UsageError(f"{path}: is not the scan that was tried on any more; give every scan a name of its own")
+            raise UsageError(f"{path}: was overwritten after its interaction; use a new file name for every scan")
         if (sha256, frame) not in self._observations:
             self._remember(parse_scan(data, path), path, sha256, frame)
         return self._observations[sha256, frame], sha256

@@ -1,4 +1,4 @@
-"""`python -m cluster`: the command line `adaafford`, for whoever starts processes (`torchrun -m cluster train ...`)."""
+"""`python -m cluster`: the command line `adaafford`, for launchers (`torchrun -m cluster train ...`)."""
 
 from adaafford.console import main
 

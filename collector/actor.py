@@ -1,4 +1,4 @@
-"""The Ray actor: a thin wrapper around a worker that pulls weights by version. The only module here that knows Ray."""
+"""The Ray actor: a thin wrapper around a worker, which pulls weights by version; only this module imports Ray."""
 
 from collections.abc import Mapping
 
@@ -12,29 +12,29 @@ from shared.store.crash_log import CrashLog
 
 
 class WorkerActor:
-    """Executes one job at a time in a process of its own.
+    """Executes one job at a time in a separate process.
 
-    The worker is made by the first job, not in `__init__`, so that whatever is wrong with a store or a folder reaches
-    the driver as the job's own exception. After any failure the driver replaces the process, since an engine may then
-    be in any state, and memory may have grown.
+    The worker is created in the first job, not in `__init__`, so that a problem with a store or a folder reaches the
+    driver as the exception of the job. After any failure the driver replaces the process, because the engine may be in
+    any state and memory may have grown.
 
     Args:
-        make_worker: makes the worker.
-        crash_log: where heartbeats go.
-        limits: what a rollout may take.
+        make_worker: creates the worker.
+        crash_log: receives heartbeats.
+        limits: of time and memory.
     """
 
     def __init__(self, make_worker: WorkerFactory, crash_log: CrashLog, limits: Limits) -> None:
         self._make_worker = make_worker
-        self._guard = Watchdog(crash_log, limits)
+        self._watchdog = Watchdog(crash_log, limits)
         self._worker: JobWorker | None = None
         self._broken = False
         self._plans: dict[str, Plan] = {}
         self._loaded: set[int] = set()
 
     def arrive(self) -> str:
-        """Return this process's name, by which its heartbeats go; which also says that it is up."""
-        self._guard.stand()
+        """Return the name of this process, which is also that of its heartbeats; the answer shows that it is up."""
+        self._watchdog.install()
         return process_name()
 
     def run(
@@ -44,16 +44,17 @@ class WorkerActor:
         policy: "list[ray.ObjectRef[Mapping[str, bytes]]]",
         quarantined: Mapping[int, str],
     ) -> JobResult:
-        """Execute `job` and return its job result; arrays never cross.
+        """Execute `job` and return its result, which has no arrays.
 
         Args:
-            plan: the reference to the plan that the job belongs to, within a list so that Ray hands over the reference
-                and the plan, which names all objects, is pulled once.
+            plan: the reference to the plan of the job. It is in a list so that Ray passes the reference, and the plan,
+                which has all objects, is pulled only once.
             job: the job.
-            policy: likewise to the weights of the plan's policy; empty if it uses none.
-            quarantined: rollouts of the job that are not to be executed, and why.
+            policy: the reference to the weights of the plan's policy, also in a list; empty if the plan uses none.
+            quarantined: rollouts of the job that are not executed, with the reasons.
         """
-        # The job behind one that failed is here already, and would hide its heartbeat before the driver has seen it.
+        # The next job was already submitted. It would overwrite the heartbeat of the failed one, which the driver
+        # reads.
         if self._broken:
             raise RuntimeError("the job before this one failed, and the process is about to be replaced")
         self._broken = True
@@ -61,20 +62,20 @@ class WorkerActor:
         if policy and known.policy_version not in self._loaded:
             worker.load_policy(known.policy_version, ray.get(policy[0]))
             self._loaded.add(known.policy_version)
-        with self._guard.job(job) as under_way:
+        with self._watchdog.job(job) as under_way:
             job_result = worker.run(known, job, quarantined, under_way)
         self._broken = False
         return job_result
 
     def _plan(self, key: str, ref: "ray.ObjectRef[Plan]") -> Plan:
-        """The plan of this name, pulled if it is not here."""
+        """The plan with this key, pulled if it is not cached."""
         if key not in self._plans:
             self._plans[key] = ray.get(ref)
         return self._plans[key]
 
     def _live_worker(self) -> JobWorker:
-        """The worker, made if there is none."""
+        """The worker, created if there is none."""
         if self._worker is None:
             self._worker = self._make_worker()
-            self._guard.bound_memory()
+            self._watchdog.bound_memory()
         return self._worker

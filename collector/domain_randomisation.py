@@ -1,7 +1,7 @@
-"""What is drawn for each rollout before anything is simulated.
+"""The random draws of a rollout that precede its simulation.
 
 A rollout is a pure function of its plan and its number: object, hidden dynamics, camera, states and actions are drawn
-from seeds derived from these alone, so that it comes out the same whichever worker runs it, whenever.
+from seeds that are derived from these. So it is the same for every worker and at any time.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from shared.types import HiddenDynamics
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """What is drawn for one rollout before anything is simulated."""
+    """The draw of one rollout: object, hidden dynamics and camera."""
 
     index: int
     object: ObjectRef
@@ -34,7 +34,7 @@ def draw_rollout(plan: Plan, index: int, attempt: int = 0) -> Draw:
     rng = seeds.generator(setting.seed, f"dynamics/{plan.key}", index)
     dynamics = draw_dynamics(ranges, setting.task_record, rng)
     for name in ranges.added:
-        # From a stream of its own, so that what else is drawn does not depend on it.
+        # A separate generator, so that the other draws do not depend on it.
         rng = seeds.generator(setting.seed, f"dynamics/{name}/{plan.key}", index)
         dynamics = replace(dynamics, values={**dynamics.values, name: draw_range(ranges[name], rng)})
     camera = setting.collection.camera

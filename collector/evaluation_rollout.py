@@ -1,12 +1,12 @@
 """Evaluation rollouts: the paper's test-time procedure, for every method on the same object and hidden dynamics.
 
-Every method starts from the same state. Its tries continue one another; after each budget the action that its adapted
-affordance chooses is executed from where the tries left the object (as in the paper), and undone. Tries that leave an
-object in the middle of its range, where it can be moved either way, make that easy whatever they taught; so another
-action is chosen and executed where all methods began.
+Every method starts from the same state, and its interactions continue each other. After each budget, the action that
+its adapted affordance chooses is executed from the state that the interactions left (as in the paper), and the state is
+restored. This action is easy if the interactions left the object in the middle of its range, where it can be moved both
+ways. So another action is chosen and executed from the start state, which is the same for all methods.
 
-With a share of points (`EvaluationConfig.exploit_share`) every method acts once more at each budget as in the published
-code, where all methods began. These rows come last and draw from random generators of their own, so that all other rows
+With a share of points (`EvaluationConfig.exploit_share`), every method acts once more at each budget, from the start
+state, as in the published code. These rows come last and draw from random generators of their own, so all other rows
 are the same to the last bit with and without them.
 """
 
@@ -26,11 +26,11 @@ class ProposerFactory(Protocol):
     """Makes proposers."""
 
     def __call__(self, name: str, rng: np.random.Generator, version: int, share: float | None = None, /) -> Proposer:
-        """The proposer of a name, such as "aip", with its own randomness, of a policy version.
+        """Make a proposer.
 
         Args:
-            name: of the proposer.
-            rng: its own randomness.
+            name: of the proposer, such as "aip".
+            rng: of its random draws.
             version: of the policy.
             share: of a cloud's points, from which it draws its points, as far as it draws any; None: its own way.
         """
@@ -105,20 +105,20 @@ def _adapt(
     budgets: list[int],
     start: Float,
 ) -> list[Interaction]:
-    """Fill the set of interactions one try at a time; at each budget, execute what the method would do, and undo it.
+    """Collect the method's interactions one at a time; at each budget, execute its action and restore the state.
 
     Returns:
-        The tries.
+        The interactions.
     """
     environment, history = recorder.environment, list[Interaction]()
     for budget in budgets:
-        if context is not None:  # A proposer that has seen enough leaves the greater budgets with what there is.
+        if context is not None:  # A proposer may stop before the greater budgets.
             left_to_try = budget - len(history)
             history += recorder.interact(context, left_to_try, Role.CONTEXT, history=history, method=method)
         if not recorder.sound or not environment.observe().movable.any():
             return history
         left = environment.state()
-        # Without tries, the one is the other.
+        # Without interactions, both states are the same.
         for role, state in ((Role.EXPLOIT, left), (Role.EXPLOIT_AT_START, start))[: 1 if context is None else 2]:
             recorder.interact(exploiter, 1, role, history=history, start=state, method=method, budget=budget)
             if not recorder.sound:

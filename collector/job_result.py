@@ -1,4 +1,4 @@
-"""What a worker is asked to do with a job, and what it tells of it; neither an engine nor Ray is imported for it."""
+"""The interface of a worker, and the result of a job; this module imports neither an engine nor Ray."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -10,18 +10,18 @@ from shared.plan import Job, Plan
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """What came of a job: counts and times, never data.
+    """The result of a job: counts and times, never data.
 
     Attributes:
         shard_id: the committed shard.
-        rollouts: how many it holds.
-        interactions: likewise.
-        successes: likewise.
+        rollouts: how many it has.
+        interactions: how many it has.
+        successes: how many of them succeeded.
         outcomes: interactions by outcome kind.
         seconds: wall time by stage, and "total".
-        quarantined: rollouts that were not executed, since they had failed again and again.
-        memory_mb: what the worker's process held in the end.
-        empty: by status and by object, rollouts that were executed and gave no interaction.
+        quarantined: rollouts that were not executed, because they had failed repeatedly.
+        memory_mb: memory of the worker's process at the end, MB.
+        empty: number of rollouts that were executed without an interaction, by status and object.
     """
 
     shard_id: str
@@ -43,7 +43,7 @@ class JobWorker(Protocol):
         ...
 
     def run(self, plan: Plan, job: Job, quarantined: Mapping[int, str], under_way: UnderWay) -> JobResult:
-        """Execute and commit `job`; do nothing if that was done before. See `collector.worker.Worker.run`."""
+        """Execute and commit `job`; do nothing if it is already committed. See `collector.worker.Worker.run`."""
         ...
 
 

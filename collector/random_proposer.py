@@ -1,4 +1,4 @@
-"""Proposers that need no policy: random actions, and given ones."""
+"""Proposers without a policy: for random actions, and for given ones."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -45,7 +45,7 @@ def _normal_to(axis: Float, rng: np.random.Generator) -> Float:
 
 
 class RandomProposer:
-    """Proposes a random visible point that the task may act on, approached from a random side; never stops.
+    """Proposes a random visible point that the task may act on, with a random approach direction; never stops.
 
     Args:
         rng: draws the actions.
@@ -60,7 +60,7 @@ class RandomProposer:
         self._edges: tuple[Observation, NDArray[np.int64]] | None = None
 
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
-        """A random action, or None where nothing that the task may act on is in view."""
+        """A random action, or None if no point that the task may act on is visible."""
         candidates = np.flatnonzero(observation.movable)
         if len(candidates) == 0:
             return None
@@ -78,7 +78,7 @@ class RandomProposer:
 
 
 class RepeatingProposer:
-    """Proposes given actions in order, each at the point nearest to its own that the task may act on.
+    """Proposes given actions in order, each at the movable point nearest to its own point.
 
     Args:
         actions: of another environment of the same object.

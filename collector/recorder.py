@@ -1,4 +1,4 @@
-"""The loop that observes, proposes and executes, and what a rollout writes down of it."""
+"""The loop that observes, proposes and executes, and the recorder of its interactions."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,18 +25,18 @@ def interact(
     execute: Callable[[Observation, Action], Outcome] | None = None,
     clock: StageClock | None = None,
 ) -> Iterator[Interaction]:
-    """The loop of the paper's test time: observe, propose, execute, remember.
+    """The paper's test-time loop: observe, propose, execute, extend the history.
 
-    It ends after `most` interactions, or earlier where the proposer proposes nothing, where no point that the task may
-    act on is in view (a part can swing out of the camera's sight), or after the simulation has diverged.
+    It ends after `most` interactions, or earlier if the proposer stops, if no point that the task may act on is visible
+    (a part can move out of the camera's view), or if the simulation has diverged.
 
     Args:
         environment: to act in.
         proposer: chooses the actions.
-        most: interactions.
-        history: interactions that the proposer knows already; it is given those of this loop as well.
-        start: [parts], a state that is put back before each interaction. None: each continues from the last.
-        execute: executes an action of an observation instead of the environment, and may note what else it sees.
+        most: number of interactions.
+        history: earlier interactions; the proposer receives these and those of this loop.
+        start: [parts], a state that is restored before each interaction; None: each continues from the last.
+        execute: executes an action instead of the environment, so that the caller can record it.
         clock: sums wall time by stage.
     """
     clock = clock or StageClock()
@@ -55,7 +55,7 @@ def interact(
         known.append(Interaction(observation, action, outcome))
         yield known[-1]
         if outcome.kind is OutcomeKind.UNSTABLE:
-            return  # Nothing that this scene shows later can be believed.
+            return  # Later states of this scene are not valid.
 
 
 @dataclass(slots=True)
@@ -118,7 +118,7 @@ class Recorder:
         method: str,
         budget: int,
     ) -> Outcome:
-        """Execute an action and write down what came of it."""
+        """Execute an action and record the interaction."""
         environment = self.environment
         part = int(observation.part_ids[action.point_index])
         body = environment.object.bodies[part]

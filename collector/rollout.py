@@ -25,10 +25,10 @@ def run_rollout(
     """Execute one rollout of a plan.
 
     Args:
-        plan: what is collected.
-        index: which of its rollouts.
-        target: the object that `collector.domain_randomisation.object_of` names.
-        make_proposer: makes the proposers that the plan needs.
+        plan: the plan.
+        index: number of the rollout.
+        target: the object that `collector.domain_randomisation.object_of` gives.
+        make_proposer: makes the proposers of the plan.
         clock: sums wall time by stage.
     """
     rested = False
@@ -51,7 +51,7 @@ def run_rollout(
 
 
 def draws_at_rest(plan: Plan, index: int, target: ArticulatedObject) -> int:
-    """How many of the draws that a rollout may make come to rest."""
+    """How many of the draws of a rollout come to rest."""
     clock = StageClock()
     environments = [make_environment(plan, draw_rollout(plan, index, k), target, clock, k) for k in range(TRIES)]
     states = [seeds.generator(plan.setting.seed, f"states/{plan.key}", index, k) for k in range(TRIES)]
@@ -59,7 +59,7 @@ def draws_at_rest(plan: Plan, index: int, target: ArticulatedObject) -> int:
 
 
 def quarantined_rollout(plan: Plan, index: int) -> RolloutRecord:
-    """The record of a rollout that is not executed, since that failed again and again: what was drawn, and no more."""
+    """The record of a quarantined rollout, which has only its draw."""
     return _record(plan, draw_rollout(plan, index), RolloutStatus.QUARANTINED, None)
 
 
@@ -82,7 +82,7 @@ def make_environment(
 def collect(
     plan: Plan, index: int, recorder: Recorder, states: np.random.Generator, make_proposer: ProposerFactory
 ) -> None:
-    """Training data: tries that continue, a policy's if there is one; then random ones from one state after another."""
+    """Collect training data: first interactions that continue, by the policy if there is one, then random ones."""
     rollout = plan.setting.collection.rollout
     rng = seeds.generator(plan.setting.seed, f"actions/{plan.key}", index)
     random: Proposer = RandomProposer(rng, plan.setting.terms.edge_share)

@@ -1,4 +1,4 @@
-"""Settings as commands make them: everything decided, and whose packages it takes."""
+"""Complete settings, with the packages that they need."""
 
 from typing import Any
 
@@ -15,12 +15,12 @@ from shared.tasks import TASKS, Task
 def make_setting(
     task: Task, collection: CollectionConfig, evaluation: EvaluationConfig | None = None, **rest: Any
 ) -> Setting:
-    """A setting that says all that was decided, and names the packages that add to this software what it uses.
+    """A complete setting, with the packages that add the things it uses.
 
     Args:
-        task: the task; one that has no name in a registry is written out.
-        collection: what it leaves to the task is filled in.
-        evaluation: what is tried on each object, in a store of an evaluation.
+        task: the task; if no registry has it, its definition is part of the setting.
+        collection: settings of the collection; missing ones are taken from the task.
+        evaluation: methods and budgets, in a store of an evaluation.
         rest: the other fields of `Setting`.
 
     Raises:
@@ -39,7 +39,7 @@ def make_setting(
 def packages_used(
     task: Task, collection: CollectionConfig, evaluation: EvaluationConfig | None = None
 ) -> tuple[str, ...]:
-    """What other packages add of what a setting uses, such as "primitive twist: my-package 1.2".
+    """The things of a setting that other packages add, such as "primitive twist: my-package 1.2".
 
     Raises:
         UsageError: something is not there.
@@ -57,7 +57,7 @@ def packages_used(
 
 
 def check_packages(setting: Setting) -> None:
-    """Hold what is installed on this machine to the packages that a setting names.
+    """Check that the packages of a setting are installed on this machine.
 
     Raises:
         UsageError: it needs others, or other versions of them.

@@ -1,4 +1,4 @@
-"""Where a worker's time goes."""
+"""Wall time of a worker by stage."""
 
 import time
 from collections import defaultdict
@@ -21,7 +21,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time that the block takes to a stage."""
+        """Add the duration of the block to a stage."""
         begun = time.perf_counter()
         try:
             yield

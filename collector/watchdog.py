@@ -1,13 +1,13 @@
 """Watchdog of a worker process: heartbeat, crash traceback, time and memory limits.
 
     watchdog = Watchdog(crash_log, limits)
-    watchdog.stand()                           # once, before anything that could crash
+    watchdog.install()                         # once, before anything that could crash
     with watchdog.job(job) as under_way:
         under_way(17)                          # before each rollout; None before and after them
 
-The engine is native code: it can crash, and it holds the interpreter's lock while it steps, so that no thread of Python
-could see that it hangs. `faulthandler` needs no lock: its handlers write the traceback of a crash, and its watchdog is
-a thread of C that writes the tracebacks of a hang and then ends the process.
+The engine is native code. It can crash, and it holds the interpreter lock during a step, so a Python thread cannot
+detect a hang. `faulthandler` does not need the lock: its signal handlers write the traceback of a crash, and its
+watchdog is a C thread that writes the traceback of a hang and then ends the process.
 """
 
 import faulthandler
@@ -23,16 +23,16 @@ from shared.plan import Job
 from shared.store.crash_log import CrashLog, Heartbeat
 
 UnderWay = Callable[[int | None], None]
-"""Called with a rollout's number before it is executed, and with None when none is under way."""
+"""Called with a rollout's number before it is executed, and with None when no rollout is running."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a worker's process may take.
+    """Limits of a worker's process.
 
     Attributes:
-        rollout_s: wall time of one rollout.
-        memory_mb: what it may take beyond what it had after its start.
+        rollout_s: wall time of one rollout, s.
+        memory_mb: growth of its memory since its start, MB.
     """
 
     rollout_s: float = 300.0
@@ -40,28 +40,28 @@ class Limits:
 
 
 class Watchdog:
-    """Stands over this process, which does nothing else than execute jobs.
+    """Watches this process, which only executes jobs.
 
     Args:
-        crash_log: where heartbeats and crash log go.
-        limits: what a rollout may take.
+        crash_log: receives heartbeats and tracebacks.
+        limits: of time and memory.
     """
 
     def __init__(self, crash_log: CrashLog, limits: Limits) -> None:
         self._crash_log = crash_log
         self._limits = limits
 
-    def stand(self) -> None:
-        """Write down crashes from now on."""
-        # Kept open, since a handler of signals cannot open files.
+    def install(self) -> None:
+        """Write the traceback of every crash from now on."""
+        # The file stays open, because a signal handler cannot open files.
         self._log = self._crash_log.open_fault_log()
         faulthandler.enable(self._log, all_threads=False)
 
     def bound_memory(self) -> None:
-        """Make allocations beyond the limit fail, so that a rollout that explodes cannot take the machine with it.
+        """Make allocations beyond the limit fail, so that one rollout cannot exhaust the memory of the machine.
 
-        The bound is on private writable memory: address space alone says nothing, since Ray and PyTorch reserve
-        gigabytes that they never touch.
+        The limit is on private writable memory and not on address space, because Ray and PyTorch reserve gigabytes of
+        address space that they never use.
         """
         taken = psutil.Process().memory_info().data
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
@@ -70,7 +70,7 @@ class Watchdog:
 
     @contextmanager
     def job(self, job: Job) -> Iterator[UnderWay]:
-        """Gives what to call before each rollout of a job; the last heartbeat stays, as it is overwritten anyway."""
+        """Give the function to call before each rollout of a job; the last heartbeat is not removed."""
 
         def under_way(rollout: int | None) -> None:
             self._crash_log.leave(Heartbeat(shard_id=job.shard_id, rollout=rollout, written=time.time()))

@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
 NOTHING: Mapping[int, str] = MappingProxyType({})
 CACHED_POLICIES = 2
-"""An evaluation may go back and forth between the last policy and the first."""
+"""An evaluation may alternate between the last policy and the first."""
 
 
 class Worker:
     """Executes jobs of any plan of one store.
 
     Args:
-        store: the store's place.
+        store: folder or URL of the store.
         objects: folder of the objects.
     """
 
@@ -54,10 +54,10 @@ class Worker:
         self._adapters: dict[int, Adapter] = {}
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
-        """Take up the weights of a policy version.
+        """Build the networks of a policy version from its files.
 
         Raises:
-            UsageError: the policy is told depth images, and the store keeps none.
+            UsageError: the policy needs depth images, and the store keeps none.
         """
         # Networks are imported with the first policy: PyTorch is half of a worker's start, and random rounds need none.
         from shared.policies.adaptation import Adapter
@@ -76,12 +76,12 @@ class Worker:
         quarantined: Mapping[int, str] = NOTHING,
         under_way: UnderWay = lambda rollout: None,
     ) -> JobResult:
-        """Execute a job's rollouts and commit its shard; do nothing if it is committed already.
+        """Execute a job's rollouts and commit its shard; do nothing if the shard is already committed.
 
         Args:
             plan: the plan that the job belongs to.
             job: the job.
-            quarantined: rollouts that are not to be executed, and why; they are recorded as such.
+            quarantined: rollouts that are not executed, with the reasons; they are recorded as quarantined.
             under_way: called with each rollout's number before it is executed, then with None.
         """
         begun = time.perf_counter()
@@ -100,9 +100,9 @@ class Worker:
         if plan.proposer in PROPOSERS.names() and (package := PROPOSERS.package_of(plan.proposer)) is not None:
             provenance["proposer"] = package
         if plan.policy_version:
-            # Beside the version in each row this says how far that was behind, where collection follows a learner.
+            # With the version in each row, this shows how old its policy was if the collection follows a learner.
             provenance["newest_policy"] = str(max(self._store.policy_versions(), default=0))
-        # A driver holds a store on a disk alone, and has seen what is missing; of a bucket there may be several.
+        # A store on a disk has one driver, which knows what is missing; a bucket may have several drivers.
         vetted = not self._store.backend.writes_in_place
         with clock.stage("write"):
             self._store.commit(plan, job, records, provenance, self._explain(job, quarantined), vetted=vetted)
@@ -110,16 +110,16 @@ class Worker:
         return _job_result(job, records, dict(clock.seconds))
 
     def execute(self, plan: Plan, index: int, clock: StageClock) -> RolloutRecord:
-        """Execute one rollout, and commit nothing.
+        """Execute one rollout without a commit.
 
         Raises:
-            UsageError: the setting needs packages that are not installed here.
+            UsageError: the setting needs packages that are not installed.
         """
         check_packages(plan.setting)
         return run_rollout(plan, index, self._load(plan, index, clock), partial(self._proposer, plan), clock)
 
     def _explain(self, job: Job, quarantined: Mapping[int, str]) -> list[Quarantined]:
-        """What the manifest says of rollouts that are not executed."""
+        """The manifest's entries of quarantined rollouts."""
         return [
             Quarantined(
                 rollout=index,
@@ -130,7 +130,7 @@ class Worker:
         ]
 
     def _load(self, plan: Plan, index: int, clock: StageClock) -> ArticulatedObject:
-        """The object of a rollout, as the plan knows it."""
+        """The object of a rollout."""
         with clock.stage("load"):
             return self._objects.load(object_of(plan, index), plan.setting.collection.collision)
 
@@ -150,7 +150,7 @@ class Worker:
 
 
 def _empty(records: Sequence[RolloutRecord]) -> dict[str, dict[str, int]]:
-    """How many rollouts were executed and gave nothing, by status and object."""
+    """How many rollouts were executed without an interaction, by status and object."""
     counts: dict[str, dict[str, int]] = {}
     for record in records:
         if not record.interactions and record.status is not RolloutStatus.QUARANTINED:

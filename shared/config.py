@@ -1,4 +1,4 @@
-"""Configuration models, one a concern, every default in one place; TOML files and flags are read through them."""
+"""Configuration models, one for each concern, with all defaults; TOML files and flags are read through them."""
 
 import difflib
 import tomllib
@@ -34,13 +34,13 @@ class StrictModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def as_document(self) -> dict[str, Any]:
-        """As JSON, together with what newer software wrote into the document that this was read from."""
+        """The model as JSON, with unknown fields of the document that it was read from."""
         named = {name: _as_document(getattr(self, name)) for name in type(self).model_fields}
         return self.model_dump(mode="json") | {n: value for n, value in named.items() if value is not None} | self.more
 
     @property
     def more(self) -> dict[str, Any]:
-        """What newer software wrote; nothing of a model that was not read from a document of a store."""
+        """Unknown fields of the document that the model was read from."""
         return dict(self.model_extra or {})
 
 
@@ -118,7 +118,7 @@ class Timing(StrictModel):
     leg_steps: int = Field(ge=1)
     """Steps of one leg of a primitive."""
     hold_steps: int = Field(ge=0)
-    """Steps of hold after a leg, at the most."""
+    """The most steps of hold after a leg."""
 
     @property
     def pace(self) -> float:
@@ -137,7 +137,7 @@ class Fidelity(StrictModel):
     """Until the fingers have closed. The dampers of the hand's drives are weaker by as much as it is faster, so that
     its forces stay as published."""
     drag: Timing = Timing(steps_per_second=240, leg_steps=480, hold_steps=480)
-    """The second leg of every primitive but push: whether what is pinched or dragged slips hangs on its speed."""
+    """The second leg of every primitive but push: whether a pinched or dragged part slips depends on its speed."""
     push_solver_iterations: int = Field(10, ge=1, le=255)
     """Of the engine, for the primitive push, and for others that do not need friction."""
     solver_iterations: int = Field(20, ge=1, le=255)
@@ -147,7 +147,7 @@ class Fidelity(StrictModel):
     end_holds_at_rest: bool = True
     """End a hold once neither hand nor object moves."""
     jointed_hand: bool = False
-    """Let the hand hang on six joints, as published, instead of floating freely under the same drives."""
+    """Attach the hand to six joints, as published, instead of a free body with the same drives."""
 
 
 FIDELITIES = {
@@ -165,10 +165,10 @@ FIDELITIES = {
 
 
 class DynamicsRanges(RootModel[dict[Annotated[str, Field(pattern=NAME)], Range]]):
-    """What hidden parameters are drawn from, by their names (see `shared.hidden`).
+    """Ranges of hidden parameters, by name (see `shared.hidden`).
 
-    Those that are always drawn are always among them; others where they are named. An empty table, or none for the
-    former, gives the range that the parameter's own record proposes.
+    Parameters that are always drawn are always included; others are included if they are named. The default of a range
+    is that of the parameter's own record.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -196,11 +196,11 @@ class DynamicsRanges(RootModel[dict[Annotated[str, Field(pattern=NAME)], Range]]
 
     @property
     def extensions(self) -> list[tuple[Registry[Any], str]]:
-        """What of it packages may add: registry and name."""
+        """The things in it that packages may add: registry and name."""
         return [(HIDDEN_PARAMETERS, name) for name in self.added]
 
     def check_known(self) -> None:
-        """See that the packages of all parameters are installed, before anything is drawn.
+        """Check that the packages of all parameters are installed, before anything is drawn.
 
         Raises:
             UsageError: one is not.
@@ -215,26 +215,26 @@ def _proposed(parameter: HiddenParameter) -> Range:
 
 
 class RolloutConfig(StrictModel):
-    """What one rollout consists of."""
+    """The interactions of one rollout."""
 
     interactions: int = Field(32, ge=1, le=4096)
     """As published: 32 for each object and draw of hidden dynamics."""
     order: Order = Order.RESTART
     """Order of the random interactions; those of AIP always continue, and come first."""
     continued: int = Field(0, ge=0)
-    """Restart order: how many random interactions come first, each continuing the last, as tries do at test time. They
-    teach AAP what a try tells that begins where another ended, which is not what it tells from a state drawn anew."""
+    """Restart order: how many random interactions at the start continue each other, as at test time. From them AAP
+    learns to interpret an interaction that begins where another one ended."""
     actions_per_state: int = Field(8, ge=1)
-    """Restart order: actions tried from one observed state."""
+    """Restart order: actions executed from one observed state."""
     edge_share: float | None = Field(None, ge=0, le=1)
-    """Share of random actions at points near a part's edge, where a gripper finds something to pinch; the rest anywhere
-    on the movable parts, as published. None: the task's own."""
+    """Share of random actions at points near a part's edge, where a gripper can pinch it; the rest are anywhere on
+    the movable parts, as published. None: the task's own."""
     context: int = Field(4, ge=0)
-    """How many interactions, at the most, AIP proposes at the start of a rollout in rounds that use it."""
+    """The most interactions that AIP proposes at the start of a rollout, in rounds that use it."""
 
 
 class CollectionConfig(StrictModel):
-    """How interactions are collected, apart from which objects, how many, and by whom."""
+    """How interactions are collected, except for the objects, their number and the workers."""
 
     primitive: Name | None = None
     """Instead of the task's own: push, push-left, push-up, pull, pull-left, pull-up, or what a package adds."""
@@ -288,7 +288,7 @@ def load_toml(path: Path) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`base` with the settings of `over` laid over it, table by table."""
+    """`base`, in which the settings of `over` replace its own, table by table."""
     merged = dict(base)
     for key, value in over.items():
         old = merged.get(key)

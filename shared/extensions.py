@@ -1,4 +1,4 @@
-"""What is found by name: what this project has of a kind, and what other people's packages add through entry points.
+"""Things that are found by name: those of this project, and those that other packages add by entry points.
 
 A package adds a primitive called "twist" by these lines of its pyproject.toml, and is found once it is installed:
 
@@ -21,10 +21,10 @@ class Registry(Generic[Item]):
     """All things of one kind, by name.
 
     Args:
-        kind: what messages call one of them, such as "primitive".
-        of: the class that an entry point must name an instance of.
-        built_in: this project's own, which no package can replace. One that is given as "module:attribute" is imported
-            when it is first wanted.
+        kind: its name in messages, such as "primitive".
+        of: the class of all things of this kind.
+        built_in: this project's own, which no package can replace. A text "module:attribute" is imported when it is
+            first needed.
     """
 
     def __init__(self, kind: str, of: type[Item], built_in: Mapping[str, Item | str]) -> None:
@@ -34,14 +34,14 @@ class Registry(Generic[Item]):
         self._loaded: dict[str, Item] = {}
 
     def names(self) -> list[str]:
-        """Those of this project, in their order, then those of other packages; none of these is imported."""
+        """The names of this project's things, in their order, then those of other packages; nothing is imported."""
         return [*self._built_in, *sorted(self._foreign())]
 
     def get(self, name: str) -> Item:
-        """The one that is called `name`; its package is imported where it is not ours.
+        """The thing called `name`; the package that adds it is imported.
 
         Raises:
-            UsageError: there is none, several packages add one, or the package that adds it cannot be imported.
+            UsageError: no thing has this name, several packages add it, or its package cannot be imported.
         """
         ours = self._built_in.get(name)
         if isinstance(ours, self._of):
@@ -105,10 +105,10 @@ def _entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
 
 
 def added_by_packages(used: Iterable[tuple[Registry[Any], str]]) -> tuple[str, ...]:
-    """Those of some used things that other packages add, such as "primitive twist: my-package 1.2".
+    """The used things that other packages add, such as "primitive twist: my-package 1.2".
 
     Args:
-        used: where each is found, and its name.
+        used: the registry and the name of each used thing.
 
     Raises:
         UsageError: one of them cannot be found.

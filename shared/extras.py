@@ -1,4 +1,4 @@
-"""Packages that only some uses need: which extra of this project brings them, and one line where one is missing."""
+"""Optional packages: the extra of this project that installs each, and the message if one is missing."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -16,12 +16,12 @@ MODULES = {"pycollada": "collada"}
 
 
 def require(purpose: str, *extras: str, without: tuple[str, ...] = ()) -> None:
-    """See that the packages of some extras are installed, before any work starts.
+    """Check that the packages of some extras are installed, before any work starts.
 
     Args:
-        purpose: what needs them, as the subject of a sentence.
+        purpose: the use that needs them, as the subject of a sentence.
         extras: names of `EXTRAS`.
-        without: packages of these that this use can do without.
+        without: packages of these extras that this use does not need.
 
     Raises:
         UsageError: one is not installed.
@@ -31,7 +31,7 @@ def require(purpose: str, *extras: str, without: tuple[str, ...] = ()) -> None:
 
 
 def require_packages(purpose: str, *packages: str) -> None:
-    """See that packages are installed.
+    """Check that packages are installed.
 
     Raises:
         UsageError: one is not.
@@ -42,7 +42,7 @@ def require_packages(purpose: str, *packages: str) -> None:
 
 
 def missing_line(purpose: str, *packages: str) -> str:
-    """What to say where packages are not installed."""
+    """The message if packages are not installed."""
     extras = sorted({extra_of(name) for name in packages} - {None}, key=str)
     names = " and ".join(filter(None, [", ".join(packages[:-1]), packages[-1]]))
     how = f"pip install 'adaafford[{','.join(map(str, extras))}]'" if extras else f"pip install {' '.join(packages)}"
@@ -50,6 +50,6 @@ def missing_line(purpose: str, *packages: str) -> str:
 
 
 def extra_of(package: str | None) -> str | None:
-    """The extra that brings a package, or a module of it; None for a package that no extra brings."""
+    """The extra that installs a package or a module; None if there is none."""
     top = (package or "").partition(".")[0]
     return next((extra for extra, names in EXTRAS.items() if top in {*names, *(MODULES.get(n) for n in names)}), None)

@@ -1,4 +1,4 @@
-"""Figures and tables: for people in Markdown and on a terminal, for programs in CSV and JSON.
+"""Numbers and tables: for people in Markdown and on a terminal, for programs in CSV and JSON.
 
 None and NaN are shown as "-"; CSV leaves them empty, and JSON has null.
 """
@@ -31,7 +31,7 @@ def percent(share: float | None, limits: Sequence[float | None] = (), decimals: 
 
 
 def number(value: float | None) -> str:
-    """An integer as it is, anything else with three decimals."""
+    """An integer unchanged, any other number with three decimals."""
     if value is None or math.isnan(value):
         return "-"
     return f"{value:.3f}" if isinstance(value, float) else str(value)

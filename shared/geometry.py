@@ -33,7 +33,7 @@ def camera_pose(azimuth_deg: float, elevation_deg: float, distance: float) -> Fl
 def view_from_world(world_from_camera: Float) -> Float:
     """The rotation [3, 3] into the view frame of a camera.
 
-    Where the camera looks straight down its own *up* direction stands in for forward.
+    If the camera looks straight down, its *up* direction replaces forward.
     """
     forward = world_from_camera[:3, 0]
     if np.hypot(forward[0], forward[1]) < 1e-6:

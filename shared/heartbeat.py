@@ -1,4 +1,4 @@
-"""A heartbeat: something that is said again and again from a thread in the background, for as long as work goes on."""
+"""A heartbeat: a function that a background thread calls repeatedly while work goes on."""
 
 import threading
 import time
@@ -7,13 +7,13 @@ from types import TracebackType
 
 
 class Heartbeat:
-    """Calls `beat` while the context lasts, and never at the same time as its end.
+    """Calls `beat` during the context, and never after its end.
 
     Args:
-        beat: what is done; it sees to its own errors.
+        beat: the function; it must handle its own errors.
         pause_s: seconds until the next one, given the seconds since the beginning.
         name: of the thread.
-        at_once: whether the first one comes at the beginning, instead of after a pause.
+        at_once: whether the first call is immediate, instead of after a pause.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class Heartbeat:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """End; a beat under way is waited for."""
+        """End the thread, after a running call."""
         self._stop.set()
         self._thread.join()
 

@@ -1,4 +1,4 @@
-"""Hidden parameters: what cannot be seen of an object, is drawn once a rollout, and must be inferred from interactions.
+"""Hidden parameters of an object: drawn once for each rollout, not visible, and to be inferred from interactions.
 
 Each is declared in one record. Drawing, settings, columns of the store, facts for the oracle, and the words and tables
 of the report follow from it. A package adds one by an entry point of the group `adaafford.hidden_parameters`
@@ -20,18 +20,18 @@ RESERVED = ("direction", "values")
 
 
 class HiddenTarget(Protocol):
-    """What a parameter is applied to: one object in a simulator, before anything has moved."""
+    """The object in a simulator that a parameter is applied to, before anything has moved."""
 
     def set_part_mass(self, mass: float) -> None:
-        """Give every movable part this mass, kg; its inertia is scaled along."""
+        """Set the mass of every movable part, kg, and scale its inertia."""
         ...
 
     def set_joint_friction(self, limit: float) -> None:
-        """Give every movable joint this Coulomb friction: N m if it turns, N if it slides."""
+        """Set the Coulomb friction of every movable joint: N m if it turns, N if it slides."""
         ...
 
     def set_surface_friction(self, coefficient: float) -> None:
-        """Give the surfaces of hand and object this friction coefficient."""
+        """Set the friction coefficient of the surfaces of hand and object."""
         ...
 
     @property
@@ -41,7 +41,7 @@ class HiddenTarget(Protocol):
 
     @property
     def joints(self) -> Sequence[Any]:
-        """The simulator's own handles of the joints that they hang on."""
+        """The simulator's own handles of their joints."""
         ...
 
 
@@ -50,15 +50,15 @@ class HiddenParameter:
     """One hidden parameter.
 
     Attributes:
-        name: lower-case letters, digits and underscores; settings, columns and the report call it this.
+        name: lower-case letters, digits and underscores; used by settings, columns and the report.
         description: what it is, in a few words.
         unit: "" for none.
-        low: of the range that it is drawn from, where the setting does not say otherwise.
-        high: likewise.
+        low: lower limit of the default range.
+        high: upper limit of the default range.
         log: whether the logarithm is uniform instead of the value.
-        apply: puts a value into force on a simulated object; called once a rollout.
-        default: what held where stores lack it: what the simulator does where it is not applied. None: every store has
-            it, which only the first three can say.
+        apply: applies a value to a simulated object; called once for each rollout.
+        default: the value of rows in stores without the parameter, which is the simulator's value if `apply` is not
+            called. None: every store has it; only for the three built-in parameters.
     """
 
     name: str
@@ -122,7 +122,7 @@ HIDDEN_PARAMETERS = Registry("hidden parameter", HiddenParameter, BUILT_IN)
 
 
 def hidden_parameter(name: str) -> HiddenParameter | None:
-    """The parameter called `name`; None where the package that adds it is not installed here, or is broken."""
+    """The parameter called `name`; None if its package is not installed or cannot be imported."""
     with suppress(UsageError):
         return HIDDEN_PARAMETERS.get(name)
     return None

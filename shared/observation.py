@@ -1,4 +1,4 @@
-"""What is kept of a cloud, and how it is rounded, so that a proposer sees exactly what a learner will read back.
+"""Selection and rounding of the points of a cloud, so that a proposer sees exactly what the learner will read.
 
 Points are kept as float16 (about 0.5 mm at 1 unit), normals as three signed bytes of 1/127 (within half a degree).
 Shapes: N points; any leading shape will do.
@@ -13,13 +13,13 @@ NORMAL_STEPS = 127
 
 
 def furthest_first(points: Float | Float32, count: int, candidates: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Indices of the points that are kept of many, in furthest-point order, so that any prefix covers them all.
+    """Indices of selected points in furthest-point order, so that any prefix covers the cloud.
 
     Args:
         points: [M, 3], at least one.
-        count: how many to keep; of fewer points some stand twice.
-        candidates: furthest points are sought among so many that are drawn at random.
-        rng: draws them.
+        count: number of selected points; if there are fewer points, some occur twice.
+        candidates: number of random points among which the furthest are searched.
+        rng: draws the candidates.
 
     Returns:
         [count].
@@ -37,7 +37,7 @@ def furthest_first(points: Float | Float32, count: int, candidates: int, rng: np
 
 
 def round_points(points: Float | Float32) -> Float32:
-    """Points, [..., 3], at the nearest places that float16 can express."""
+    """Points, [..., 3], rounded to float16."""
     return points.astype(np.float16).astype(np.float32)
 
 
@@ -47,7 +47,7 @@ def round_normals(normals: Float | Float32) -> Float32:
 
 
 def pack_normals(normals: Float | Float32) -> NDArray[np.int8]:
-    """Unit normals, [..., 3], as the signed bytes that are kept."""
+    """Unit normals, [..., 3], as signed bytes."""
     packed: NDArray[np.int8] = np.rint(np.clip(normals, -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
     return packed
 

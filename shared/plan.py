@@ -1,7 +1,7 @@
 """Plans: pure functions from configuration and seed to numbered rollouts.
 
-A *setting* fixes everything that makes rows comparable; a store holds one. A *plan* adds who proposes. A *job* is a
-range of a plan's rollouts and makes one *shard*. Nothing here knows who does the work, or when.
+A *setting* fixes everything that makes rows comparable; a store holds one. A *plan* adds the proposer. A *job* is a
+range of a plan's rollouts and makes one *shard*. Nothing here depends on workers or on time.
 """
 
 from collections.abc import Iterable
@@ -25,7 +25,7 @@ class ObjectRef(StrictModel):
 
     @property
     def identity(self) -> tuple[str, str, str]:
-        """What rows name it by, without what newer software may have added."""
+        """Its identity in rows, without fields that newer software may have added."""
         return self.id, self.category, self.content_hash
 
 
@@ -36,21 +36,21 @@ def parse_plan_key(key: str) -> tuple[str, int]:
 
 
 ROLLOUTS_PER_SHARD = 8
-"""Unless told otherwise: some seconds' work, which is what a kill can cost, of which the commit takes a few percent."""
+"""The default: some seconds of work, which a kill can cost at most; the commit takes a few percent of them."""
 Budget = Annotated[int, Field(ge=1, le=64)]
-"""A number of tries."""
+"""A number of interactions."""
 
 
 class EvaluationConfig(StrictModel):
-    """What is tried on each test object."""
+    """Methods and budgets of an evaluation, and the number of queries."""
 
     methods: tuple[MethodName, ...] = ("where2act", "ours-random", "ours-final")
     budgets: tuple[Budget, ...] = Field((1, 2, 4), min_length=1)
     queries: int = Field(24, ge=1)
-    """Random test interactions a rollout, which critics are asked about (F-score)."""
+    """Random test interactions of each rollout, whose success the critics predict (F-score)."""
     exploit_share: float | None = Field(None, gt=0, le=1, exclude_if=lambda share: share is None)
-    """Also act at a point drawn from this share of the cloud's points, the best ones, where the tries began; AIP then
-    draws the points of its tries so, too. As published: 0.01. None: not done; documents leave it out."""
+    """Each method also acts from the start state at a point drawn from this share of the cloud, the best points; AIP
+    draws its points in the same way. As published: 0.01. None: not done; documents leave it out."""
 
 
 class Setting(StrictModel):
@@ -90,7 +90,7 @@ class Setting(StrictModel):
 
     @property
     def dynamics(self) -> DynamicsRanges:
-        """What hidden parameters are drawn from; the task is looked up only where the setting leaves it to it."""
+        """Ranges of the hidden parameters: the setting's, or those of its task."""
         return self.collection.dynamics or self.terms.dynamics
 
     @property
@@ -100,7 +100,7 @@ class Setting(StrictModel):
 
     @property
     def terms(self) -> Terms:
-        """What holds, whether `collection` says it or leaves it to the task.
+        """The terms of `collection`, completed by the task.
 
         Raises:
             UsageError: there is no such task.
@@ -120,7 +120,7 @@ def found_by_name(task: Task, evaluation: EvaluationConfig | None) -> list[tuple
 
 
 class Plan(StrictModel):
-    """A setting, and who proposes the interactions."""
+    """A setting with a proposer and a policy version."""
 
     setting: Setting
     proposer: str = Field("random", pattern=r"^[a-z][a-z0-9-]{0,30}$")
@@ -154,7 +154,7 @@ class Job:
 
 
 def missing_ranges(rollouts: int, done: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """What of [0, `rollouts`) no range in `done` covers, as half-open ranges in order; those of `done` may overlap."""
+    """Half-open ranges of [0, `rollouts`) that no range in `done` covers, ascending; ranges in `done` may overlap."""
     gaps, start = [], 0
     for low, high in sorted(done):
         gaps.append((start, min(low, rollouts)))
@@ -163,7 +163,7 @@ def missing_ranges(rollouts: int, done: Iterable[tuple[int, int]]) -> list[tuple
 
 
 def covered(ranges: Iterable[tuple[int, int]]) -> int:
-    """How many numbers lie in some half-open ranges, which may overlap."""
+    """How many numbers are in some half-open ranges, which may overlap."""
     count = end = 0
     for low, high in sorted(ranges):
         count += max(high - max(low, end), 0)
@@ -176,7 +176,7 @@ def missing_jobs(plan_key: str, rollouts: int, done: list[tuple[int, int]], per_
 
     Args:
         plan_key: the plan.
-        rollouts: how many are wanted in all.
+        rollouts: how many there should be in total.
         done: committed half-open ranges.
         per_shard: the most rollouts that one job may hold.
     """

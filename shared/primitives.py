@@ -1,4 +1,4 @@
-"""Primitives: what the hand does at a point. One record describes each; all are found by name in `PRIMITIVES`.
+"""Primitives: motions of the hand at a point. One record describes each; `PRIMITIVES` finds them by name.
 
 Lengths are metres. The *start frame* is the hand frame (forward, left, up, where *up* is the approach direction d) as
 it stands when the trial starts, with its origin moved to the touched point p; so (0, 0, -0.10) is 0.10 before p.
@@ -36,8 +36,8 @@ class PrimitiveSpec:
         then: the second leg, at the slower timing of `Fidelity.drag`; None: there is none.
         intended: [3], start frame, the unit direction in which the touched point must move, up to 60 deg; None: any.
             Whatever it is, the joint must move by more than 0.01 rad or m, or half of its range.
-        closes_fingers: whether the fingers start open and close after the approach; a trial that then holds nothing is
-            over ("no-grasp").
+        closes_fingers: whether the fingers start open and close after the approach; a trial without
+            a grasp then ends ("no-grasp").
         checks_contact: whether a first contact of the palm, or of a finger with another part than the target, ends the
             trial ("hand-contact", "wrong-part").
         needs_friction: whether friction between hand and part carries the part along, so that the engine takes the

@@ -1,7 +1,7 @@
-"""Progress of long work: a live bar on a terminal, a plain line every few seconds elsewhere; both say the time left.
+"""Progress of long work: a live bar on a terminal, elsewhere a plain line every few seconds.
 
 with Progress("merging, shards", leaves="STORE") as progress:
-    merge(..., progress.show)            # called with how many are done, and how many there are
+    merge(..., progress.show)            # called with the number of done items and the total
 """
 
 import math
@@ -28,16 +28,16 @@ Advance = Callable[[], None]
 
 
 class Progress:
-    """Shows how far some work is, on standard error; use it as a context.
+    """Shows the progress of some work on standard error; use it as a context manager.
 
     Args:
-        title: what is done, or counted.
-        total: how many there will be; 0 where `show` will say.
-        unit: what is counted, if the title does not say.
-        done: how many are done already; the pace is of the others.
-        leaves: what will be there in the end, such as the path of a store; a first line says so.
-        details: what else a line says, such as a rate; called when it is shown.
-        live: whether to draw a bar; None: where standard error is a terminal.
+        title: name of the work.
+        total: number of items; 0 if `show` gives it later.
+        unit: name of the items, if the title does not contain it.
+        done: number of items that are already done; the speed is that of the others.
+        leaves: the result, such as the path of a store, for a first line.
+        details: further text of a line, such as a rate; called when the line is shown.
+        live: whether to draw a bar; None: if standard error is a terminal.
         say: prints a line; None: on standard error.
         clock: monotonic seconds.
     """
@@ -88,11 +88,11 @@ class Progress:
             self._bar.stop()
 
     def advance(self) -> None:
-        """One more is done."""
+        """Count one more item."""
         self.show(self.done + 1)
 
     def show(self, done: int, total: int | None = None, most_left_s: float = math.inf) -> None:
-        """So many are done.
+        """Set the number of done items.
 
         Args:
             done: of all.
@@ -116,7 +116,7 @@ class Progress:
         return max(self._clock() - self._begun, 1e-9)
 
     def describe(self) -> str:
-        """Done and left, details, and the time left at the pace so far, in one line."""
+        """Done and remaining items, details, and the remaining time at the present speed, in one line."""
         parts = [f"{self.done}/{self.total}{self._unit}"] if self.total else []
         if self._details is not None:
             parts.append(self._details())

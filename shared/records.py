@@ -1,4 +1,4 @@
-"""Records: an executed rollout as the collector hands it to the store, with all that a replay needs."""
+"""Records: an executed rollout as the collector gives it to the store, with all data for a replay."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -15,21 +15,21 @@ class InteractionRecord:
         step: number within the rollout.
         observation: index into `RolloutRecord.observations`.
         action: p and R, world frame.
-        outcome: what came of it.
+        outcome: its outcome.
         normal: [3], world frame, surface normal at p.
-        primitive: name of what was executed.
+        primitive: name of the executed primitive.
         order: whether the next interaction starts from the same state or from where this one ended.
         role: what the interaction is for.
-        proposer: who chose the action.
+        proposer: name of the proposer of the action.
         policy_version: the policy that it used; 0 for none.
-        method: evaluation only: whose context or exploit it is, else "".
-        budget: evaluation only: how many tries came before an exploit, else -1.
+        method: evaluation only: the method of a context or an exploit, otherwise "".
+        budget: evaluation only: number of interactions before an exploit, otherwise -1.
         target_part: 1-based movable part that p lies on.
         target_link: its link's name in the URDF.
         target_joint: its joint's name in the URDF.
         joint_names: of all movable joints in the URDF, in part order.
         joint_positions: theirs at the start.
-        joint_limits: [parts, 2], limits that were in force (the direction modes change them).
+        joint_limits: [parts, 2], the limits that were used (the direction modes change them).
         joint_twist: [6], hidden: (w, v) of the target joint at the start, world frame. A point p of the part starts to
             move by w x p + v a unit of joint position, so w is a hinge's signed axis, and v a slide's.
         hand_start: [7], world pose of the hand frame at the start, xyz then quaternion wxyz.
@@ -85,7 +85,7 @@ class RolloutRecord:
         seed: the plan's seed, from which all of the rollout was drawn.
         fidelity: name of the fidelity preset.
         status: whether it was executed; there are neither observations nor interactions if not.
-        observations: each one once, however many actions were tried from it.
+        observations: each one once, for any number of actions.
         interactions: in the order they were executed.
     """
 

@@ -1,4 +1,4 @@
-"""Randomness as a function of the campaign's seed and of what is drawn, never of who draws it or when."""
+"""Random generators that depend on the campaign's seed and on what is drawn, not on workers or time."""
 
 import zlib
 
@@ -17,7 +17,7 @@ def seed_sequence(seed: int, purpose: str, *indices: int) -> np.random.SeedSeque
 
 
 def generator(seed: int, purpose: str, *indices: int) -> np.random.Generator:
-    """A NumPy generator of its own for `purpose` and `indices` (see `seed_sequence`)."""
+    """A separate NumPy generator for `purpose` and `indices` (see `seed_sequence`)."""
     return np.random.Generator(np.random.PCG64(seed_sequence(seed, purpose, *indices)))
 
 

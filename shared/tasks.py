@@ -1,4 +1,4 @@
-"""Tasks: which primitive, on which parts, from which states, under which hidden dynamics.
+"""Tasks: a primitive, the parts that it acts on, start states, and hidden dynamics.
 
 The paper's tasks are built in. Packages add others by entry points of the group "adaafford.tasks", and a TOML file that
 is named on the command line defines one of its own (docs/extending.md).
@@ -23,11 +23,11 @@ TASK_FILE_SUFFIX = ".toml"
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """What a configuration says, or else its task: the one place where what is left to the task is looked up.
+    """The settings of a configuration, completed by those of its task.
 
     Attributes:
-        primitive: name of what trials execute.
-        dynamics: what hidden dynamics are drawn from.
+        primitive: name of the primitive.
+        dynamics: ranges of the hidden parameters.
         edge_share: share of random actions at points near a part's edge.
     """
 
@@ -60,7 +60,7 @@ class Task(StrictModel):
     of a panel pinch nothing, so that half of them there doubles the positives."""
 
     def terms(self, collection: CollectionConfig) -> Terms:
-        """What holds under `collection`, which may leave some of it to the task."""
+        """The terms of a collection; settings that `collection` leaves out are the task's."""
         share = collection.rollout.edge_share
         return Terms(
             primitive=collection.primitive or self.primitive,
@@ -69,7 +69,7 @@ class Task(StrictModel):
         )
 
     def resolve(self, collection: CollectionConfig) -> CollectionConfig:
-        """`collection` with what it leaves to the task filled in, so that a store says all that was decided.
+        """`collection` completed by the task, so that a store records all settings.
 
         Raises:
             UsageError: a hidden parameter is named whose package is not installed.
@@ -121,7 +121,7 @@ def task_named(name: str) -> Task:
     """The task called `name`.
 
     Raises:
-        UsageError: there is no such task; the message lists those there are.
+        UsageError: there is no such task; the message lists the known ones.
     """
     task = TASKS.get(name)
     if task.name != name:
@@ -135,7 +135,7 @@ def task_of(told: str) -> Task:
 
 
 def read_task(file: Path) -> Task:
-    """The task that a TOML file defines: a setting a line, as `Task` has them.
+    """The task that a TOML file defines, with the fields of `Task`.
 
     Raises:
         UsageError: the file is missing, or a setting is missing, unknown or not allowed, or the name is taken.

@@ -78,7 +78,7 @@ class Order(StrEnum):
     """How the interactions of a rollout follow each other."""
 
     RESTART = "restart"
-    """Several actions are tried from one observed state, which is restored before each."""
+    """Several actions are executed from one observed state, which is restored before each."""
     CONTINUE = "continue"
     """Each interaction starts where the last one left the object (the paper's test time)."""
 
@@ -89,22 +89,22 @@ class Role(StrEnum):
     COLLECT = "collect"
     """Training data."""
     QUERY = "query"
-    """A random test interaction that a critic is asked about (F-score)."""
+    """A random test interaction whose success critics predict (F-score)."""
     CONTEXT = "context"
-    """A test-time try that fills the set of interactions."""
+    """A test-time interaction, part of the set I."""
     EXPLOIT = "exploit"
-    """The action that the adapted affordance chooses at the end, where the tries left the object (sample-success)."""
+    """The final action of a method, in the state that its interactions left (sample-success)."""
     EXPLOIT_AT_START = "exploit-at-start"
-    """What it chooses where the tries began, so that methods can be compared on one state (start-success)."""
+    """The final action in the start state, which is the same for all methods (start-success)."""
     CONTEXT_BY_SHARE = "context-by-share"
-    """A try whose point was drawn from the best share of the cloud instead of being the best of all."""
+    """An interaction whose point was drawn from the best share of the cloud instead of being the best of all."""
     EXPLOIT_BY_SHARE = "exploit-by-share"
-    """What the adapted affordance chooses where the tries began, at a point drawn from the best share of the cloud."""
+    """The final action in the start state, at a point drawn from the best share of the cloud."""
 
 
 @dataclass(frozen=True, slots=True, init=False)
 class HiddenDynamics:
-    """What cannot be seen, drawn once a rollout and applied to every movable part alike.
+    """Hidden dynamics, drawn once for each rollout and applied to every movable part.
 
     Example:
         dynamics = HiddenDynamics(part_mass=0.2, joint_friction=0.05, surface_friction=1.0)
@@ -167,7 +167,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """u = (p, R): where the gripper touches and how it is turned."""
+    """u = (p, R): the interaction point and the gripper orientation."""
 
     point_index: int
     """Index of p in the observation's cloud."""
@@ -189,7 +189,7 @@ class Action:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of an action. A robot needs to fill only the first three fields."""
+    """The outcome of an action. A robot only needs to fill the first three fields."""
 
     kind: OutcomeKind
     motion: float
@@ -208,7 +208,7 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Interaction:
-    """I = (O, p, R, m): one try and what was learnt from it."""
+    """I = (O, p, R, m): an observation, an action and its outcome."""
 
     observation: Observation
     action: Action
@@ -216,23 +216,23 @@ class Interaction:
 
 
 class Environment(Protocol):
-    """Anything that can be looked at and acted upon: a SAPIEN scene, or a real robot before a real door."""
+    """An object that can be observed and acted on: in SAPIEN, or in front of a real robot."""
 
     def observe(self) -> Observation:
-        """Look at the object as it stands."""
+        """Observe the object in its present state."""
         ...
 
     def execute(self, action: Action) -> Outcome:
-        """Try the action; a failure of physics is an outcome, not an exception."""
+        """Execute the action; a physical failure is an outcome, not an exception."""
         ...
 
 
 class Proposer(Protocol):
-    """Anything that chooses what to try next."""
+    """Chooses the next action."""
 
     @property
     def name(self) -> str:
-        """What rows call it: "random", "aip", ..."""
+        """Its name in rows of a store: "random", "aip", ..."""
         ...
 
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:

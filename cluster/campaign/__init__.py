@@ -1,1 +1,1 @@
-"""The alternation of collection and training as stages over one folder, and what it will cost."""
+"""The alternation of collection and training as stages of one run folder, and its cost estimate."""

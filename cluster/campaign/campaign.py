@@ -42,7 +42,7 @@ from shared.store.provenance import changed_versions, software_versions
 
 
 def steps_of(config: CampaignConfig) -> list[AlternationStep]:
-    """All steps of a campaign, in order; each is done once, and may be done again if a kill comes before its note."""
+    """All steps of a campaign, in order; a step may be repeated if a kill comes before its log entry."""
     rounds = alternation(
         lambda number: number <= config.alternations,
         adopts=config.start_from is not None,
@@ -52,9 +52,9 @@ def steps_of(config: CampaignConfig) -> list[AlternationStep]:
 
 
 class Campaign:
-    """One run, from nothing or from wherever it was stopped to its report.
+    """One run, which starts or continues and ends with its report.
 
-    It is the `Rollouts` of its alternation: it collects them itself.
+    It implements `Rollouts` for its alternation, because it collects them itself.
 
     Args:
         run: its folder.
@@ -70,10 +70,10 @@ class Campaign:
         self._learner = Child(lambda line: self._say(f"  {line}"), run.path)
 
     def execute(self) -> None:
-        """Do what is left to do.
+        """Execute the remaining steps.
 
         Raises:
-            AdaAffordError: a step cannot go on; what was done stays done.
+            AdaAffordError: a step failed; finished steps stay finished.
         """
         run, config, steps = self._run, self._config, steps_of(self._config)
         with exclusive_lock(run.path / DRIVER_LOCK), closing(self._learner):
@@ -81,7 +81,7 @@ class Campaign:
             run_log.note("attempt", workers=config.workers, software=software_versions())
             changed = changed_versions(run.begun_with())
             if changed and any(step.name not in run_log.finished for step in steps):
-                self._say(f"begun with other software: {changed}; what is made from here on may differ by it")
+                self._say(f"begun with other software: {changed}; new results may differ because of it")
             with worker_groups(config.workers, config.limits, config.ray_address) as make_worker_group:
                 self._crew = Crew(make_worker_group)
                 run_log.run({step.name: partial(self._do, step) for step in steps}, self._say)
@@ -104,7 +104,7 @@ class Campaign:
         return perform(step, self, self._train)
 
     def collect(self, step: Collect) -> Mapping[str, Any]:
-        """Collect what is missing of a round."""
+        """Collect the missing rollouts of a round."""
         store, folder, rollouts = Store.open(self._run.store), self._run.objects_folder(), self._config.rollouts
         plan = Plan(setting=store.setting, proposer=step.proposer, policy_version=step.version)
         wanted = rollouts.of_round(step.version, len(store.setting.objects))
@@ -114,13 +114,13 @@ class Campaign:
         return figures_of(collected)
 
     def job(self, number: int) -> StageJob:
-        """Every round learns from all that the store holds."""
+        """The training job of a round, which uses all rollouts of the store."""
         used = self._run.objects_used()
         train, validation = (frozenset(ref.id for ref in refs) for refs in (used.train, used.validation))
         return StageJob("prior", self._run.store, self._run.trainings, None, train, validation or None)
 
     def publish(self, step: Publish) -> Mapping[str, Any]:
-        """Put a policy into the store, where collectors find it."""
+        """Publish a policy in the store for the collectors."""
         # They want the learner's cores and its memory.
         self._learner.close()
         folder = self._run.training(step.folder)
@@ -181,7 +181,7 @@ class Campaign:
         )
 
     def _evaluate(self) -> Mapping[str, Any]:
-        """Try every method on unseen objects with the last policy, and write the table."""
+        """Evaluate every method on unseen objects with the last policy, and write the table."""
         run, rollouts, version = self._run, self._config.rollouts, self._config.alternations + 1
         evaluation = Evaluation(
             store=Store.open(run.evaluation),

@@ -1,4 +1,4 @@
-"""What a campaign will cost, before it is begun: interactions, core-hours and bytes by stage, from measured rates.
+"""The cost estimate of a campaign: interactions, core-hours and bytes by stage, from measured rates.
 
 Nothing is simulated and nothing is written. The rates are of one core of the machine that `RATES` names, unloaded;
 other machines differ by a factor, the shares of the stages hardly.
@@ -76,7 +76,7 @@ LEFT_BY_TRAINING = 5
 
 @dataclass(frozen=True, slots=True)
 class StageCost:
-    """What one stage will cost."""
+    """The estimated cost of one stage."""
 
     stage: str
     interactions: int
@@ -86,11 +86,11 @@ class StageCost:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What a campaign will cost.
+    """The estimated cost of a campaign.
 
     Attributes:
-        task: which it is.
-        objects: how many are trained on, validate and are tested on.
+        task: its name.
+        objects: number of training, validation and test objects.
         stages: in order.
     """
 
@@ -168,7 +168,7 @@ class _Costs:
         )
 
     def _evaluation(self, rollouts: int) -> StageCost:
-        """Random queries, then every method's tries, each from a state of its own, and its actions."""
+        """Random queries, then the interactions of every method, each with a new observation, and its actions."""
         told = self.config.evaluation
         methods = [METHODS.get(name) for name in told.methods]
         trying = list(methods)
@@ -259,7 +259,7 @@ class _Costs:
         return 3 * FORWARD_SHARE * self.encode_s + 2 * (points + 100) * self.rates.scored_row_s
 
     def _clouds_a_rollout(self, tries: int) -> int:
-        """How often a rollout looks: before each try that continues the last, then before each state's random ones."""
+        """How many observations a rollout has: one for each continuing interaction and for each drawn state."""
         told = self.config.collection.rollout
         if told.order is Order.CONTINUE and not tries:
             return told.interactions
@@ -274,7 +274,7 @@ class _Costs:
 
 
 def multiply_adds(network: NetworkConfig, points: int) -> float:
-    """Multiplications that PointNet++ makes of a cloud, forward."""
+    """Multiplications of a forward pass of PointNet++ over one cloud."""
     sizes = [points, *(min(count, points) for count in network.centres)]
     total, width = 0, 0
     widths = [0]

@@ -30,21 +30,21 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as a shell has it."""
 
 COMMANDS = {
-    "run": "collect, train, collect with what was learnt, evaluate: a whole campaign",
-    "resume": "go on with a run that was stopped",
+    "run": "a whole campaign: collect, train, collect proposed interactions, evaluate",
+    "resume": "continue a run that was stopped",
     "evaluate": "the table of the paper: F-score and sample-success of all methods, on any objects",
-    "compare": "the runs of several seeds as one table, beside the paper's figures",
-    "report": "print a run's results again, and draw its page anew",
-    "adapt": "propose the next try on a scanned object, and say where it can be moved",
-    "export-policy": "a run's policy in half precision with its model card, to take elsewhere",
-    "calibrate": "fit a policy's probabilities to few interactions with your own objects",
-    "collect": "collect interactions into a store, without any learning",
-    "train": "prior, aap, aip or alternate: train from a store alone",
-    "curve": "how much trainings find out from stored tries, between Where2Act and an oracle",
-    "status": "how a run or a store stands: rate, done, left, workers",
-    "learn": "train beside collection: wait for rollouts, publish policies for the collectors",
-    "store": "info, verify, digest, replay, repair, compact, merge, export, migrate or check-place: look after stores",
-    "objects": "generate, import, export, check, preview, film or decompose: the objects",
+    "compare": "one table of the runs of several seeds, beside the paper's figures",
+    "report": "print the results of a run again, and write its page again",
+    "adapt": "propose the next interaction with a scanned object, and predict where it can be moved",
+    "export-policy": "write a run's policy in half precision, with a model card",
+    "calibrate": "fit a policy's probabilities to a few interactions with your own objects",
+    "collect": "collect interactions into a store, without training",
+    "train": "prior, aap, aip or alternate: train from a store",
+    "curve": "how much critics know about hidden facts after some interactions",
+    "status": "status of a run or a store: rate, done, left, workers",
+    "learn": "train beside a collection: wait for rollouts, and publish policies",
+    "store": "info, verify, digest, replay, repair, compact, merge, export, migrate or check-place: work with stores",
+    "objects": "generate, import, export, check, preview, film or decompose objects",
     "bench": "fidelity, dynamics, collect or learner: measure what helps to choose settings",
     "version": "print the version",
 }
@@ -66,7 +66,7 @@ NEEDS = {
 RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate")
 """Long work, with which the same command goes on after an interruption."""
 
-USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` tells more\n\n" + "\n".join(
+USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` shows more\n\n" + "\n".join(
     f"  {name:<15}{text}" for name, text in COMMANDS.items()
 )
 
@@ -151,13 +151,13 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
     except OSError as error:
         logger.info("what the system refused", exc_info=True)
         place = f"{error.filename}: " if error.filename else ""
-        return _complain(f"{place}{error.strerror or error}; see to this and run the same command again", 1)
+        return _complain(f"{place}{error.strerror or error}; correct this and run the same command again", 1)
     return code
 
 
 def _interrupted(args: list[str]) -> int:
     """Say how to go on after Ctrl-C."""
-    hint = "; what is committed stays, and the same command goes on" if args[0] in RESUMABLE else ""
+    hint = "; committed data stay, and the same command continues" if args[0] in RESUMABLE else ""
     print(
         f"adaafford: interrupted{hint}: adaafford {plain(without_secrets(' '.join(args)))}"
         if hint

@@ -1,1 +1,1 @@
-"""Drives a collection, and writes down how it stands."""
+"""The driver of a collection, and its status."""

@@ -1,4 +1,4 @@
-"""Drives a collection by a worker group: committed rollouts stay, missing ones are made, and none is made twice."""
+"""The driver of a collection: it lets a worker group make the rollouts that a store does not have yet."""
 
 import logging
 import time
@@ -20,17 +20,17 @@ from shared.reproduction import reproduction
 from shared.store import Store, reopen_quarantined
 from shared.store.maintenance.info import quarantined_in
 
-OpenFleet = Callable[[], WorkerGroup]
+OpenWorkerGroup = Callable[[], WorkerGroup]
 
 MOST_REPORTED = 10
-"""Quarantined rollouts that a collection prints; a store that is all wrong would print thousands."""
+"""How many quarantined rollouts are printed; in a bad case there are thousands."""
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """What one attempt added."""
+    """What one attempt added to a store."""
 
     tally: Tally
     seconds: float
@@ -40,12 +40,12 @@ class Collected:
 
 @dataclass(frozen=True, slots=True)
 class Newest:
-    """In the place of a plan: a proposer with the newest policy that is published, whichever that is at the moment.
+    """Used instead of a plan: a proposer that always uses the newest published policy.
 
     Attributes:
-        proposer: who proposes.
-        per_version: the most rollouts of one version, after which the next one is waited for (rounds); None: it
-            proposes until there is a newer one (continuous collection).
+        proposer: its name.
+        per_version: the most rollouts of one version, after which the collection waits for the next version (rounds);
+            None: a version is used until there is a newer one (continuous collection).
     """
 
     proposer: str = "aip"
@@ -53,7 +53,7 @@ class Newest:
 
     @property
     def key(self) -> str:
-        """What people call it."""
+        """Its name in messages."""
         return f"{self.proposer}-latest"
 
 
@@ -62,7 +62,7 @@ def collect(
     plan: Plan | Newest,
     rollouts: int,
     per_shard: int,
-    open_worker_group: OpenFleet,
+    open_worker_group: OpenWorkerGroup,
     objects: Path,
     *,
     retry_quarantined: bool = False,
@@ -70,18 +70,18 @@ def collect(
     """Bring `plan` to `rollouts` committed rollouts.
 
     Args:
-        store: of the plan's setting.
-        plan: who proposes, with which policy.
-        rollouts: how many the store shall hold of this plan, or of this proposer with any policy, those of earlier
-            attempts included.
-        per_shard: rollouts a shard.
-        open_worker_group: gives the worker group; not called if nothing is left to do.
+        store: has the plan's setting.
+        plan: the proposer and its policy.
+        rollouts: how many rollouts of this plan, or of this proposer with any policy, the store has in the end,
+            including those of earlier attempts.
+        per_shard: rollouts of a shard.
+        open_worker_group: gives the worker group; not called if no rollout is missing.
         objects: folder of the objects, for the command that reproduces a failed job.
-        retry_quarantined: whether rollouts that were quarantined are executed again.
+        retry_quarantined: whether quarantined rollouts are executed again.
 
     Raises:
-        WorkerError: a job failed again and again; the message ends with the command that reproduces it. Or all
-            rollouts that the store holds of the plan gave no interaction.
+        WorkerError: a job failed repeatedly; the message ends with the command that reproduces it. Or none of the
+            plan's rollouts in the store has an interaction.
         StoreError: the plan's policy is not in the store.
     """
     # Only one driver works on a store, so leftovers of crashed workers can be removed.
@@ -101,13 +101,13 @@ def collect(
             return Collected(progress.tally, 0.0, 0)
         worker_group = open_worker_group()
         version, per_version = (plan.policy_version, None) if isinstance(plan, Plan) else (None, plan.per_version)
-        in_force = PolicySource(store, plan.proposer, version, _Adopting(store, worker_group))
+        policy_source = PolicySource(store, plan.proposer, version, _Announcing(store, worker_group))
         counts = {key: covered(ranges) for key, ranges in held.items()}
-        series = RolloutQueue(in_force, missing, per_shard, per_version, counts)
-        snapshot = _Snapshot(plan.key, already, rollouts, progress, worker_group, in_force)
+        queue = RolloutQueue(policy_source, missing, per_shard, per_version, counts)
+        snapshot = _Snapshot(plan.key, already, rollouts, progress, worker_group, policy_source)
         try:
-            with status_kept(store.backend, snapshot, lambda: series.waiting, progress.say):
-                worker_group.run(series, progress)
+            with status_kept(store.backend, snapshot, lambda: queue.waiting, progress.say):
+                worker_group.run(queue, progress)
         except JobError as error:
             command = reproduction(store.where, error.job.shard_id, objects)
             raise WorkerError(f"{error}; reproduce it with: {command}") from None
@@ -119,16 +119,16 @@ def collect(
 
 
 def _plan_keys(store: Store, plan: Plan | Newest) -> list[str]:
-    """The plan, or all of a proposer with any policy."""
+    """The key of the plan, or the keys of all plans of the proposer."""
     if isinstance(plan, Plan):
         return [plan.key]
-    # By the names of shards: a plan whose file was lost has made its rollouts all the same.
+    # The names of shards are used, because the file of a plan may be lost while its rollouts are there.
     return sorted({job.plan_key for job in store.jobs() if parse_plan_key(job.plan_key)[0] == plan.proposer})
 
 
 @dataclass(frozen=True, slots=True)
-class _Adopting:
-    """Makes a plan known to the store, and its policy to the workers."""
+class _Announcing:
+    """Gives the policy of a new plan to the workers, and adds the plan to the store."""
 
     store: Store
     worker_group: WorkerGroup
@@ -137,22 +137,22 @@ class _Adopting:
         if plan.policy_version:
             self.worker_group.load_policy(plan.policy_version, self.store.read_policy(plan.policy_version))
         self.store.add_plan(plan)
-        logger.info("plan %s is in force", plan.key, extra={"plan": plan.key})
+        logger.info("plan %s is used from now on", plan.key, extra={"plan": plan.key})
 
 
 @dataclass(frozen=True, slots=True)
 class _Snapshot:
-    """Tells how a collection stands."""
+    """Makes the status of a collection."""
 
     title: str
     already: int
     total: int
     progress: CollectionProgress
     worker_group: WorkerGroup
-    in_force: PolicySource
+    policy_source: PolicySource
 
     def __call__(self, state: State) -> DriverStatus:
-        tally, plan = self.progress.tally, self.in_force.plan
+        tally, plan = self.progress.tally, self.policy_source.plan
         return DriverStatus(
             process=process_name(),
             written=time.time(),
@@ -174,7 +174,7 @@ class _Snapshot:
 
 
 def _require_interactions(store: Store, plan: Plan | Newest) -> None:
-    """See that the store holds an interaction of the plan; manifests are read up to the first that has one."""
+    """Check that the plan has an interaction in the store; manifests are read up to the first that has one."""
     keys = _plan_keys(store, plan)
     if any(store.manifest(job).interactions for key in keys for job in store.jobs(key)):
         return
@@ -189,7 +189,7 @@ def _require_interactions(store: Store, plan: Plan | Newest) -> None:
 
 
 def _report_quarantined(store: Store, plan: Plan | Newest, objects: Path) -> None:
-    """Say which rollouts were given up, why, and how to see it happen."""
+    """Log which rollouts are quarantined, why, and the command that executes each alone."""
     shards = (shard for key in _plan_keys(store, plan) for shard in store.manifests(key))
     given_up = quarantined_in(shards, store.where, objects)
     logger.warning("%d rollouts of %s are quarantined; `adaafford store info` lists them", len(given_up), plan.key)

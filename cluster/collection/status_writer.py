@@ -1,9 +1,8 @@
-"""How a collection stands: what its driver writes down every few seconds, and who else reads it.
+"""The status file of a collection, which its driver writes every few seconds.
 
-    STORE/status/driver.json     replaced as a whole; about the moment, so no data and never in a digest
+    STORE/status/driver.json     replaced as a whole; no data, and never part of a digest
 
-The driver alone writes it, so it is read without asking the driver, on any machine that reaches the store, and also
-after the driver has ended.
+Only the driver writes it. It can be read on any machine that can reach the store, also after the driver has ended.
 """
 
 import logging
@@ -21,9 +20,9 @@ from shared.store.backends.base import StorageBackend
 from shared.store.layout import STATUS_FOLDER
 
 BEAT_S = 2.0
-"""How often the driver writes how it stands; one small file, whatever is collected."""
+"""How often the driver writes its status, s."""
 SILENT_S = 30.0
-"""A driver that has written nothing for so long is not at work; clocks of machines may differ by some seconds."""
+"""A driver without a new status for this long has ended; clocks may differ by some seconds."""
 MAX_STATUS_BYTES = 1 << 16
 _KEY = f"{STATUS_FOLDER}/driver.json"
 
@@ -33,23 +32,23 @@ logger = logging.getLogger(__name__)
 
 
 class DriverStatus(StrictModel):
-    """How a collection stands."""
+    """The status of a collection."""
 
     process: str = Field(max_length=200)
-    """The driver's, as `shared.io.files.process_name` has it."""
+    """Name of the driver's process, by `shared.io.files.process_name`."""
     written: float = Field(ge=0)
     """Seconds since 1970, by the driver's clock."""
     state: State
-    """Waiting: all that the policies so far may propose is handed out."""
+    """Waiting: a new policy is needed for more rollouts."""
     title: str = Field(max_length=100)
     """What is collected: a plan, or a proposer that follows a learner."""
     policy: int | None = Field(None, ge=0)
-    """The version in force; 0 is none, null that the first one is waited for."""
+    """The version that proposes; 0 means none, null that the collection waits for the first one."""
     done: int = Field(ge=0)
-    """Rollouts that are there, earlier attempts included."""
+    """Rollouts in the store, including earlier attempts."""
     total: int = Field(ge=0)
     elapsed_s: float = Field(ge=0)
-    """Since work began in this attempt; what follows is of this attempt, too."""
+    """Since the start of this attempt; the fields below are also of this attempt."""
     rollouts: int = Field(ge=0)
     interactions: int = Field(ge=0)
     successes: int = Field(ge=0)
@@ -73,18 +72,18 @@ class DriverStatus(StrictModel):
 
     @property
     def left(self) -> int:
-        """Rollouts to do."""
+        """Missing rollouts."""
         return max(self.total - self.done, 0)
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until all is done, at the pace so far; None if there is none to judge by."""
+        """Seconds until all is done, at the present speed; None if it is unknown."""
         if self.state != "collecting" or not self.rollouts:
             return None
         return self.left * self.elapsed_s / self.rollouts
 
     def is_alive(self, now: float) -> bool:
-        """Whether the driver is at work, as far as that can be told from here.
+        """Whether the driver runs, as far as this machine can know.
 
         Args:
             now: seconds since 1970.
@@ -94,7 +93,7 @@ class DriverStatus(StrictModel):
 
 
 def read_status(place: StorageBackend) -> DriverStatus | None:
-    """How the last collection into a store stands; None where none has said so, or what it said is damaged."""
+    """The status of the last collection into a store; None if it is missing or damaged."""
     try:
         if not place.exists(_KEY):
             return None
@@ -111,14 +110,14 @@ def status_kept(
     say: Callable[[str], None],
     beat_s: float = BEAT_S,
 ) -> Iterator[None]:
-    """Write how a collection stands, in the background for as long as the context lasts, and how it ended.
+    """Write the status of a collection in the background during the context, and its final state.
 
     Args:
-        place: of the store.
-        stand: tells how it stands, given the state.
-        is_waiting: whether all that may be done now is handed out.
-        say: is told when that begins.
-        beat_s: how often.
+        place: storage backend of the store.
+        stand: makes the status from the state.
+        is_waiting: whether the collection waits for a new policy.
+        say: receives a line when it begins to wait.
+        beat_s: interval, s.
     """
     before: State = "collecting"
 

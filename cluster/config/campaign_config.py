@@ -1,4 +1,4 @@
-"""The configuration of a campaign: everything that decides what a run produces, and how many workers do it."""
+"""The configuration of a campaign: all settings that determine its results, and the number of workers."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ EXECUTION_SETTINGS = frozenset({"workers", "ray_address", "rollout_limit_s", "me
 
 
 class RolloutCounts(StrictModel):
-    """How many rollouts each round makes."""
+    """Number of rollouts of each round."""
 
     random: int = Field(100, ge=1)
     """In the first round, proposed at random."""
@@ -30,7 +30,7 @@ class RolloutCounts(StrictModel):
     interactions an object, and 10 trials a test object."""
 
     def total(self, count: int, objects: int) -> int:
-        """How many rollouts `count` means where there are so many objects."""
+        """The number of rollouts that `count` means for this many objects."""
         return count * objects if self.per_object else count
 
     def of_round(self, version: int, objects: int) -> int:
@@ -39,7 +39,7 @@ class RolloutCounts(StrictModel):
 
 
 class SplitConfig(StrictModel):
-    """Which objects are trained on: shares within each category, unless lists or categories say what is tested on."""
+    """The split of the objects: fractions within each category, unless lists or categories define the test objects."""
 
     train: float = Field(0.7, gt=0, le=1)
     validation: float = Field(0.1, ge=0, le=1)
@@ -76,7 +76,7 @@ class SplitConfig(StrictModel):
 
 
 class ProceduralConfig(StrictModel):
-    """The built-in objects that are generated where no folder of objects is given."""
+    """The procedural objects that are generated if no folder of objects is given."""
 
     per_category: int = Field(8, ge=1, le=10_000)
     """Objects of each category that the task applies to."""
@@ -103,7 +103,7 @@ class CampaignConfig(ObjectSelection):
     workers: int = Field(2, ge=0, le=4096)
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""
     ray_address: RayAddress | None = None
-    """Of a running Ray cluster; a private session on this machine where none is given."""
+    """HOST:PORT of a running Ray cluster, or auto; default: a private session on this machine."""
     rollout_limit_s: float = Field(300.0, gt=0)
     """A worker that takes longer for one rollout is taken for hung, and replaced; after three times the rollout is
     quarantined."""

@@ -14,20 +14,20 @@ class EvaluateSettings(ObjectSelection):
     task: str | None = None
     """Another task than the policy's, of the same primitive."""
     methods: tuple[MethodName, ...] = ()
-    """Which methods are compared; all whose networks are trained where none is named."""
+    """The methods; default: all whose networks are trained."""
     budgets: tuple[Budget, ...] = Field((1, 2, 4), min_length=1)
-    """After how many tries they are judged."""
+    """Numbers of interactions after which methods are evaluated."""
     trials: int = Field(10, ge=1, le=100_000)
-    """Trials an object: each draws hidden dynamics and a camera, tries and acts anew. As published: 10."""
+    """Trials of each object, each with new hidden dynamics and a new camera. As published: 10."""
     queries: int = Field(24, ge=1, le=10_000)
     """Random test interactions a trial, which critics are asked about (F-score)."""
     exploit_share: float | None = Field(None, gt=0, le=1)
-    """Also act at a point drawn from the best points of the cloud, this share of it, and let AIP draw so; as published:
-    0.01. Adds the column "sample-success, best share"."""
+    """Each method also acts at a point drawn from this share of the cloud, the best points, and AIP draws its points in
+    the same way; as published: 0.01. Adds the column "sample-success, best share"."""
     policy_version: int | None = Field(None, ge=1)
-    """Of a run: which of its policies; the last where none is named."""
+    """Version of the run's policy; default: the last."""
     collection: CollectionConfig = CollectionConfig()
-    """Of a policy without a run: how its trials are seen and simulated; a run says so itself."""
+    """Camera and simulation of the trials of a policy without a run; a run has its own."""
     seed: int | None = Field(None, ge=0, lt=2**63)
     """Instead of the run's, or instead of 1."""
     per_shard: int = Field(4, ge=1, le=4096)
@@ -35,7 +35,7 @@ class EvaluateSettings(ObjectSelection):
     workers: int = Field(2, ge=0, le=4096)
     """Ray actors, one CPU each; 0 does everything in one process without Ray."""
     ray_address: RayAddress | None = None
-    """Of a running Ray cluster; a private session on this machine where none is given."""
+    """HOST:PORT of a running Ray cluster, or auto; default: a private session on this machine."""
     rollout_limit_s: float = Field(600.0, gt=0)
     """A worker that takes longer for one trial is taken for hung, and replaced."""
     memory_limit_mb: float = Field(2000.0, gt=0)

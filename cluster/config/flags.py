@@ -1,4 +1,4 @@
-"""From defaults, a preset, a file and flags to one validated model: later ones win, and every setting has a flag."""
+"""Settings from defaults, a preset, a file and flags; later ones replace earlier ones, and every setting has a flag."""
 
 import argparse
 from collections.abc import Callable, Mapping
@@ -85,7 +85,7 @@ def _named_range(word: str) -> tuple[str, dict[str, Any]]:
 
 
 def preset_names() -> list[str]:
-    """The presets that the package brings."""
+    """The names of the presets."""
     return sorted(path.stem for path in PRESETS_FOLDER.glob("*.toml"))
 
 
@@ -93,7 +93,7 @@ def preset(name: str) -> dict[str, Any]:
     """The settings of a preset.
 
     Raises:
-        UsageError: there is no such preset; the message lists those there are.
+        UsageError: there is no such preset; the message lists the known ones.
     """
     if name not in preset_names():
         raise UsageError(f"unknown preset '{name}'; allowed: {', '.join(preset_names())}")
@@ -101,7 +101,7 @@ def preset(name: str) -> dict[str, Any]:
 
 
 def layered(model: type[Model], preset_name: str | None, file: Path | None) -> Model:
-    """The model's defaults under a preset under a TOML file; what flags are then laid over.
+    """The settings of a model: its defaults, replaced by a preset, replaced by a TOML file; flags are applied later.
 
     Raises:
         UsageError: the preset or the file is missing, or has a setting that is unknown or not allowed.
@@ -116,7 +116,7 @@ def layered(model: type[Model], preset_name: str | None, file: Path | None) -> M
 
 
 def early_flags(args: list[str], *names: str) -> dict[str, str | None]:
-    """The values of a few flags that decide the defaults of all others, before those are parsed."""
+    """The values of a few flags, parsed first because they determine the defaults of the others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in names:
         parser.add_argument(f"--{name}")
@@ -139,10 +139,10 @@ def parse_flags(
 
     Args:
         command: declares the flags.
-        args: what was given.
+        args: the arguments.
         prog: the subcommand, for the usage text.
         default: values of flags that are not given.
-        program: what stands before the subcommand in the usage text.
+        program: text before the subcommand in the usage text.
 
     Raises:
         UsageError: a value is of the right type but not allowed.
@@ -162,7 +162,7 @@ def parse_flags(
 
 
 def dispatch(name: str, actions: Mapping[str, Action], args: list[str], operand: str) -> int:
-    """Run the action of a command that its first argument names.
+    """Run the action of a command that is its first argument.
 
     Args:
         name: of the command, such as "store".
@@ -176,7 +176,7 @@ def dispatch(name: str, actions: Mapping[str, Action], args: list[str], operand:
     chosen, first = args[:1], next(iter(actions))
     if chosen in (["-h"], ["--help"]):
         print(
-            f"usage: adaafford {name} {{{','.join(actions)}}} {operand}; `adaafford {name} {first} --help` tells more"
+            f"usage: adaafford {name} {{{','.join(actions)}}} {operand}; `adaafford {name} {first} --help` shows more"
         )
         return 0
     if not chosen or chosen[0] not in actions:

@@ -1,4 +1,4 @@
-"""Which objects a run uses: a folder that the user names, or built-in procedural ones; and which it is tested on."""
+"""The objects of a run: a folder of the user, or procedural ones; and their split."""
 
 import logging
 from collections.abc import Iterable
@@ -29,10 +29,10 @@ def objects_for(
     seed: int,
     lists: tuple[Path, ...] = (),
 ) -> tuple[Catalogue, Path]:
-    """The catalogue of objects that suit `task`, and the folder that they lie in.
+    """The catalogue of objects that suit `task`, and their folder.
 
     Args:
-        task: what is to be done with them.
+        task: the task.
         selection: the user's folder, list and categories; without a folder, built-in objects are made.
         built_in: where those are generated, and found again.
         per_category: how many of each category that the task applies to.
@@ -55,7 +55,7 @@ def objects_for(
 
 
 def require_same_objects(wanted: Iterable[ObjectRef], folder: Path) -> None:
-    """See that a folder holds some objects, by their content; it may hold others, too.
+    """Check that a folder holds some objects, by their content; it may hold others, too.
 
     Raises:
         UsageError: it cannot be read, or an object is missing or has other content.
@@ -102,9 +102,9 @@ def lists_of(splits: SplitConfig) -> tuple[Path, ...]:
 
 
 def split_as_told(refs: Iterable[ObjectRef], splits: SplitConfig, seed: int) -> ObjectSplit:
-    """Split objects by the lists or categories that the user names, else by shares within each category.
+    """Split objects by the user's lists or categories, otherwise by fractions within each category.
 
-    Where it is said what is tested on, train and validation share the others in the proportion of their fractions.
+    If the test objects are given, training and validation divide the others in proportion to their fractions.
 
     Raises:
         UsageError: a list cannot be read, or the lists have an object in common.

@@ -1,4 +1,4 @@
-"""Which objects a command works with, as far as the user says so; flags and files of several commands share this."""
+"""The user's selection of objects, which flags and files of several commands share."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,9 +21,9 @@ RayAddress = Annotated[str, AfterValidator(_without_credentials)]
 
 
 class ObjectSelection(StrictModel):
-    """What a command's settings say of its task and its objects; settings inherit it, so that its flags have no prefix.
+    """Settings of task and objects; other settings inherit from it, so its flags have no prefix.
 
-    Where `task` names a TOML file, the settings take up its contents, and need the file no more.
+    If `task` is a TOML file, the settings contain the definition, and the file is not needed any more.
     """
 
     task: str | None = None
@@ -31,11 +31,11 @@ class ObjectSelection(StrictModel):
     task_definition: Annotated[Task | None, tyro.conf.Suppress] = Field(None, exclude_if=lambda task: task is None)
     """What the file said."""
     objects: Path | None = None
-    """A folder of objects in PartNet-Mobility's layout; built-in procedural objects where none is given."""
+    """A folder of objects in PartNet-Mobility's layout; default: procedural objects."""
     object_list: Path | None = None
     """Only the objects of this list, `<id> <category>` a line, such as Where2Act publishes."""
     categories: tuple[str, ...] = ()
-    """Only objects of these; "train" and "test" stand for the paper's ten and five. All where none is named."""
+    """Only objects of these; "train" and "test" stand for the paper's ten and five. Default: all."""
 
     @property
     def task_record(self) -> Task:

@@ -19,14 +19,17 @@ from shared.io.text import markdown
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, FIGURE_FILE = "curve.json", "curve.csv", "curve.md", "curve.png"
 CRITICS = {
     "where2act": "Where2Act",
-    "random": "AAP, random tries",
-    "aip": "AAP, tries by AIP",
-    "information": "AAP, tries by expected information",
-    "oracle": "oracle, told the hidden facts",
+    "random": "AAP, random interactions",
+    "aip": "AAP, interactions by AIP",
+    "information": "AAP, interactions by expected information",
+    "oracle": "oracle, given the hidden facts",
 }
-COLUMNS = ("training", "critic", "tries", "F-score", "gap closed", "best F", "BCE", "AUC", "ECE", "from no tries")
+COLUMNS = (
+    *("training", "critic", "interactions", "F-score", "gap closed", "best F", "BCE", "AUC", "ECE"),
+    "from no interactions",
+)
 GAIN_COLUMNS = (
-    "tries",
+    "interactions",
     "by a random one",
     "by AIP's choice",
     "by the best, in hindsight",
@@ -80,14 +83,14 @@ def as_markdown(curves: Curves) -> str:
     pooled = [row for row in curves.rows if not row.run]
     base_rate = pooled[0].base_rate
     lines = [
-        f"# {markdown(curves.task)}: what critics know after some tries",
+        f"# {markdown(curves.task)}: what critics know after some interactions",
         "",
         f"{curves.rollouts} stored rollouts on {pooled[0].objects} objects that no training saw, each drawn "
-        f"{curves.draws} times: half of its interactions may be tried, the other half is asked about; "
+        f"{curves.draws} times: half of its interactions are candidates for the context, the other half are queries; "
         f"{100 * base_rate:.1f}% of these succeed. F-score at threshold 0.5. Gap closed: of that in cross entropy "
-        "between Where2Act and the oracle, which is told the hidden facts; in the last column, between AAP without "
-        "tries and the oracle. In brackets: 95% bootstrap intervals over objects, all seeds together. Digest of the "
-        f"interactions: `{curves.digest[:16]}`.",
+        "between Where2Act and the oracle, which is given the hidden facts; in the last column, between AAP without "
+        "interactions and the oracle. In brackets: 95% bootstrap intervals over objects, all seeds together. Digest of "
+        f"the interactions: `{curves.digest[:16]}`.",
         "",
         *markdown_table(COLUMNS, map(_cells, pooled), left=2),
     ]
@@ -95,8 +98,8 @@ def as_markdown(curves: Curves) -> str:
     for name, gains in curves.gains.items():
         lines += [
             "",
-            f"Drop of the loss on the questions by the next try, in thousandths of a nat ({markdown(name)}, its first "
-            "run):",
+            f"Drop of the loss on the queries by the next interaction, in thousandths of a nat ({markdown(name)}, its "
+            "first run):",
             "",
             *markdown_table(GAIN_COLUMNS, map(_gain_cells, gains), left=0),
         ]
@@ -165,7 +168,7 @@ def draw_curves(curves: Curves, path: Path) -> None:
     left.set_ylabel("F-score at threshold 0.5")
     right.set_ylabel("closed share of the gap in cross entropy")
     for axes in (left, right):
-        axes.set_xlabel("tries")
+        axes.set_xlabel("interactions")
         axes.grid(alpha=0.3)
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle(f"{curves.task}: {pooled[0].objects} objects not seen in training", fontsize=10)

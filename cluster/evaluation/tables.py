@@ -36,14 +36,14 @@ LIKE_FOR_LIKE: Mapping[Measure, str] = {
 """The same measured as the paper did, so that absolute figures can be compared with its (docs/evaluation.md)."""
 _SHOWN: Mapping[str, str] = {
     "method": "method",
-    "budget": "tries",
+    "budget": "interactions",
     **{str(name): shown for name, shown in MEASURES.items()},
     "gap_closed": "gap closed",
     "trials": "trials",
     "best_f": "best F",
     "bce": "BCE",
     "auc": "AUC",
-    "mean_tries": "tries made",
+    "mean_tries": "interactions made",
     **{str(name): shown for name, shown in LIKE_FOR_LIKE.items()},
 }
 """Columns that people see, and what they call them."""

@@ -47,7 +47,7 @@ AVERAGED = ("best_f", "bce", "auc", "base_rate", "mix_base_rate", "mean_tries")
 """Figures that do not follow from counts: their means over runs."""
 
 COLUMNS = (
-    *("method", "tries", "F-score", "paper", "sample-success", "paper", "from the start"),
+    *("method", "interactions", "F-score", "paper", "sample-success", "paper", "from the start"),
     *("gap closed", "best F", "BCE", "AUC"),
 )
 """Of the table that people see."""
@@ -90,12 +90,12 @@ class PooledRow:
 
     Attributes:
         method: which method.
-        budget: how many tries.
+        budget: how many interactions.
         shares: of each of `MEASURES` and `LIKE_FOR_LIKE`: the figure, and where its interval begins and ends.
         by_run: of each of these: the figure in each run.
         paper: of each of `PUBLISHED_MEASURES`: the paper's own figure, percent; None where it has none.
         gap_closed: the share of the gap in F-score between Where2Act and the oracle.
-        trials: how many actions were executed where tries had left an object.
+        trials: how many actions were executed from the state that the interactions left.
         averages: of each of `AVERAGED`, the mean over runs.
     """
 
@@ -291,10 +291,10 @@ def as_markdown(comparison: Comparison) -> str:
         f"{len(comparison.seeds)} {runs} {_seeds(comparison)}). In percent; in brackets "
         "95% bootstrap intervals over objects, all together. "
         "F-score of the critic at threshold 0.5 on random interactions, of which "
-        f"{percent(comparison.base_rate)}% succeed. Sample-success: of the chosen action where the tries left the "
-        "object, as in the paper; from the start: where they began. Gap closed: of that in F-score between Where2Act "
-        "and the oracle, which is told the hidden facts. The paper's figures are of other objects and another "
-        "simulator: orders and trends can be compared.",
+        f"{percent(comparison.base_rate)}% succeed. Sample-success: of the chosen action in the state that the "
+        "interactions left, as in the paper; from the start: in the state in which they began. Gap closed: the share "
+        "of the gap in F-score between Where2Act and the oracle, which is given the hidden facts. The paper's figures "
+        "are of other objects and another simulator, so only rankings and trends can be compared.",
         "",
         *markdown_table(COLUMNS, map(_cells, comparison.rows)),
         "",
@@ -302,7 +302,7 @@ def as_markdown(comparison: Comparison) -> str:
         "Run by run (F-score / sample-success / from the start):",
         "",
         *markdown_table(
-            ("method", "tries", *(f"seed {seed}" for seed in comparison.seeds)),
+            ("method", "interactions", *(f"seed {seed}" for seed in comparison.seeds)),
             ([markdown(row.method), str(row.budget), *_by_run(row)] for row in comparison.rows),
         ),
     ]
@@ -346,7 +346,7 @@ def _by_run(row: PooledRow) -> list[str]:
 
 
 def draw_comparison(comparison: Comparison, path: Path) -> None:
-    """Each measure against the number of tries: a curve for each method, level lines for what tries nothing."""
+    """Each measure against the number of interactions; methods without interactions are horizontal lines."""
     figure = Figure(figsize=(13, 5), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(MEASURES))
@@ -366,7 +366,7 @@ def draw_comparison(comparison: Comparison, path: Path) -> None:
                 low, high = ([100 * row.shares[measure][end] for row in rows] for end in (1, 2))
                 axes.fill_between(budgets, low, high, color=colours[method], alpha=0.15, linewidth=0)
         axes.set_title(f"{name} (%)", fontsize=10)
-        axes.set_xlabel("tries")
+        axes.set_xlabel("interactions")
         axes.set_xticks(sorted({row.budget for row in comparison.rows if row.budget}))
         axes.grid(alpha=0.3)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)

@@ -64,7 +64,7 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 
 
 def worker_seconds(run_log: RunLog) -> dict[str, float]:
-    """What workers spent their time on over all collection rounds, as far as rounds noted it."""
+    """Seconds of workers by stage over all collection rounds that recorded them."""
     spent: Counter[str] = Counter()
     for name in run_log.finished:
         if name.startswith("collect-"):

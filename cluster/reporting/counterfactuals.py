@@ -1,6 +1,6 @@
-"""Experiments on what cannot be seen: one hidden fact is varied, the same actions are tried, and affordance is adapted.
+"""Counterfactuals: one hidden fact is varied, the same actions are executed, and the affordance is adapted.
 
-What the camera sees is the same under every value, so that whatever differs afterwards was learnt from the tries.
+The observation is the same for every value, so differences of the affordance were learned from the interactions.
 """
 
 from collections.abc import Sequence
@@ -32,11 +32,11 @@ from shared.policies.proposers import proposer_named
 from shared.types import Action, Direction, Float32, HiddenDynamics, Interaction, Observation, Proposer
 
 TRIES = 4
-"""Actions that are tried under each value."""
+"""Actions that are executed under each value."""
 TRIED_BY = "fps"
-"""Who chooses them, with what comes of them under the first value: spread over what looks actionable."""
+"""The proposer that chooses them under the first value: spread over actionable points."""
 OBJECTS_TRIED = 5
-"""Test objects that are looked at, at the most, for one that can still be read."""
+"""The most test objects that are searched for one that can still be read."""
 ELEVATION_DEG = 40.0
 CABINET_M = (1.0, 0.6, 1.2, 0.03)
 """Width, depth, height and overhang of the cabinet that is hung on either side."""
@@ -63,7 +63,7 @@ class Variation:
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """What the tries under one value taught."""
+    """The adapted affordance after the interactions under one value."""
 
     label: str
     observation: Observation
@@ -72,7 +72,7 @@ class Posterior:
 
 
 class Counterfactuals:
-    """Where the experiments take place: a run's task, camera, fidelity and policy.
+    """Runs the experiments with the task, camera, fidelity and policy of a run.
 
     Args:
         setting: of the run's evaluation.
@@ -85,7 +85,7 @@ class Counterfactuals:
         self.task = setting.task_record
 
     def posteriors(self, variation: Variation) -> list[Posterior]:
-        """The affordance under each value after the same tries; values under which nothing can be tried are skipped."""
+        """The affordance under each value after the same interactions; values without an interaction are skipped."""
         found: list[Posterior] = []
         actions: list[Action] = []
         for case in variation.cases:

@@ -19,22 +19,23 @@ def hidden_facts_section(
     """The figure: a tab for each hidden fact, a cloud for each of its values."""
     key, title = "hidden-facts", "Affordance under hidden facts"
     if target is None:
-        return Section(key, title, ("No test object of the run can be read any more, so nothing could be tried.",))
+        return Section(key, title, ("No test object of the run can be read any more, so nothing was simulated.",))
     found = variations(counterfactuals.setting, target, twins)
     drawings = []
     for number, variation in enumerate(found, start=1):
-        say(f"trying hidden facts, {number} of {len(found)}: {variation.name}")
+        say(f"simulating hidden facts, {number} of {len(found)}: {variation.name}")
         posteriors = counterfactuals.posteriors(variation)
         if posteriors:
             drawings.append(_drawing(variation.name, posteriors, counterfactuals.adapter))
     if not drawings:
-        return Section(key, title, (f"Nothing could be tried on {target.ref.id}.",))
+        return Section(key, title, (f"No interaction with {target.ref.id} was possible.",))
     lead = (
         f"{shortened(target.ref.category)} {target.ref.id}, not seen in training"
         + (" (for the hinge's side: one cabinet, hung on its left and on its right)" if twins else "")
-        + f". First before any try; then, under each value, after the same {TRIES} tries (green: success, red: "
-        "failure), with all other hidden facts at the middle of their range. Every cloud of a row looks the same to "
-        "the camera, so that what differs in colour was learnt from the tries. Drag a cloud to turn all.",
+        + f". The first cloud is before any interaction. The others are after the same {TRIES} interactions under each "
+        "value (green: success, red: failure), with all other hidden facts at the middle of their range. The camera "
+        "sees the same in every cloud of a row, so differences in colour were learned from the interactions. Drag a "
+        "cloud to turn all.",
     )
     return Section(key, title, lead, drawings=tuple(drawings))
 
@@ -56,4 +57,4 @@ def _drawing(name: str, posteriors: Sequence[Posterior], adapter: Adapter) -> Dr
 
 def _successes(posterior: Posterior) -> str:
     count = sum(interaction.outcome.success for interaction in posterior.history)
-    return f"{count} of {len(posterior.history)} tries succeeded"
+    return f"{count} of {len(posterior.history)} interactions succeeded"

@@ -109,9 +109,9 @@ def source_of_training(training: Path, store: Store, results: Path | None, origi
 def export(source: Source, licence: str) -> dict[str, bytes]:
     """weights.safetensors in half precision, policy.json, README.md, the card, and done.json, by name.
 
-    The last says what objects the policy has seen, so that whoever fine-tunes it is not tested on them.
+    The last has the objects that the policy has seen, so that fine-tuning does not test on them.
 
-    The networks of the baselines stay behind: nobody but an evaluation asks for them.
+    The networks of the baselines are left out, because only an evaluation uses them.
     """
     policy = source.policy.without_baselines()
     files = policy.to_files(half=True)
@@ -156,8 +156,8 @@ def head(policy: Policy, files: dict[str, bytes], licence: str) -> str:
     parameters = sum(tensor.numel() for tensor in policy.modules().parameters())
     return f"""# AdaAfford policy: {policy.task}
 
-Where and how a gripper can move one articulated object, from a point cloud, adapted by a few tries: Where2Act prior,
-Adaptive Affordance Prediction and Adaptive Interaction Proposal (Wang et al., ECCV 2022).
+Where and how a gripper can move one articulated object, from a point cloud, adapted by a few interactions: the
+Where2Act prior, Adaptive Affordance Prediction and Adaptive Interaction Proposal (Wang et al., ECCV 2022).
 
 | | |
 | --- | --- |

@@ -1,4 +1,4 @@
-"""Affordance as the camera sees it, before and after tries: affordance.png of a run, and what a benchmark draws."""
+"""Affordance from the camera's view before and after interactions: affordance.png of a run, and benchmark pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,10 +41,10 @@ class Panel:
 
 
 def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
-    """Draw the evaluation rollout whose affordance its tries changed the most.
+    """Draw the evaluation rollout whose affordance its interactions changed the most.
 
-    The first panel is the affordance with no tries; each further panel is the affordance after one more, drawn with
-    that try as an arrow, its outcome in the title. Every panel shows the observation that the try was chosen on.
+    The first panel is the affordance without interactions. Each further panel is the affordance after one more, which
+    is drawn as an arrow, with its outcome in the title. Every panel shows the observation before its interaction.
 
     Returns:
         Whether there was any rollout to draw; if not, no file is written.
@@ -55,10 +55,10 @@ def draw_adaptation(evaluation: Store, policy: Policy, out: Path) -> bool:
         return False
     chosen, history = trial.rollout, trial.history
     first = history[0].observation
-    panels = [Panel(first, adapter.affordance(first, []), "before any try")]
+    panels = [Panel(first, adapter.affordance(first, []), "before any interaction")]
     for count, tried in enumerate(history, start=1):
         heat = adapter.affordance(tried.observation, history[:count])
-        title = f"after try {count}: {verdict(tried.outcome)}"
+        title = f"after interaction {count}: {verdict(tried.outcome)}"
         panels.append(Panel(tried.observation, heat, title, tried))
     title = f"{policy.task}: {chosen.object.category} {chosen.object.id}, not seen in training"
     draw_panels([panels], f"{title} (hidden: {hidden(chosen.dynamics)})", out)
@@ -112,7 +112,7 @@ def _draw(axes: Axes, panel: Panel, most: float) -> PathCollection:
 
 
 def _draw_arrow(axes: Axes, interaction: Interaction) -> None:
-    """The approach of the try: the arrow's head is where the gripper touches."""
+    """The approach of the interaction: the arrow's head is where the gripper touches."""
     action = interaction.action
     tail, head = _project(
         np.stack([action.point - ARROW_LENGTH * action.approach, action.point]), interaction.observation

@@ -1,4 +1,4 @@
-"""What AIP proposes to try, and what each try teaches, step by step (AdaAfford, Fig. 5)."""
+"""The interactions that AIP proposes, and how each changes the affordance, step by step (AdaAfford, Fig. 5)."""
 
 import numpy as np
 import plotly.graph_objects as go
@@ -15,16 +15,16 @@ MOST_TRIES = 3
 
 
 def proposals_section(trial: EvaluationTrial | None, adapter: Adapter) -> Section:
-    """The episode in which the tries of a run taught the most."""
-    key, title = "proposals", "What AIP proposes, and what each try teaches"
+    """The evaluation trial whose interactions changed the affordance most."""
+    key, title = "proposals", "What AIP proposes, and how each interaction changes the affordance"
     if trial is None:
-        return Section(key, title, ("No test object was tried by AIP.",))
+        return Section(key, title, ("AIP proposed no interaction in the evaluation.",))
     rollout, history = trial.rollout, trial.history[:MOST_TRIES]
     lead = (
         f"{shortened(rollout.object.category)} {rollout.object.id}, not seen in training; hidden: "
-        f"{hidden(rollout.dynamics)}. Of the evaluation, the object whose affordance the tries changed the most.",
-        "Above: where AIP expects a try to tell most, from the least to the most of each cloud, and what it proposes "
-        "there (black). Below: the affordance after that many tries, with the last of them (green: success, red: "
+        f"{hidden(rollout.dynamics)}. This is the trial whose affordance its interactions changed most.",
+        "Above: AIP's actionability, scaled from the least to the most of each cloud, and the interaction that it "
+        "proposes (black). Below: the affordance after that many interactions, with the last one (green: success, red: "
         "failure). Static parts are grey. Drag a cloud to turn all.",
     )
     return Section(key, title, lead, drawings=(Drawing(_figure(history, adapter), solid=True),))
@@ -39,7 +39,7 @@ def _figure(history: list[Interaction], adapter: Adapter) -> go.Figure:
         arrows = (proposed(history[count].action),) if count < len(history) else ()
         values = information(observation, before, adapter)
         title = f"AIP, {after(count)}: at most {values[observation.movable].max():.2g}"
-        title += f"<br>proposes try {count + 1}" if arrows else "<br>&nbsp;"
+        title += f"<br>proposes interaction {count + 1}" if arrows else "<br>&nbsp;"
         above.append(CloudView(title, observation, _stretched(values, observation), arrows))
         shown = observations[count - 1] if count else observation
         title = f"affordance, {after(count)}<br>" + (plain(verdict(before[-1].outcome)) if before else "&nbsp;")
@@ -49,7 +49,7 @@ def _figure(history: list[Interaction], adapter: Adapter) -> go.Figure:
 
 
 def information(observation: Observation, history: list[Interaction], adapter: Adapter) -> Float32:
-    """The AIP actionability of every point, [N]; 0 where nothing can be tried."""
+    """The AIP actionability of every point, [N]; 0 for points that may not be acted on."""
     values = np.zeros(len(observation.points), np.float32)
     candidates = movable_points(observation)
     values[candidates] = adapter.information(observation, candidates, adapter.z(history))

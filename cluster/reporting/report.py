@@ -24,13 +24,13 @@ from shared.store.provenance import software_versions
 
 
 def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, say: Callable[[str], None]) -> None:
-    """Write summary.json, affordance.png and report.html from what the run's stages left.
+    """Write summary.json, affordance.png and report.html from the results of the run's stages.
 
     Args:
         run: a run that was evaluated.
         config: its configuration.
-        experiments: whether to try hidden facts in the simulator for the page.
-        say: is told what is under way.
+        experiments: whether to simulate other hidden facts for the page.
+        say: receives a line for each step.
     """
     run_log, store = RunLog(run.log), Store.open(run.store)
     used = run.objects_used()

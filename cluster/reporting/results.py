@@ -1,4 +1,4 @@
-"""What each method knows and does after each budget of tries: the table, the adaptation curves, the first figures."""
+"""The results of each method after each number of interactions: table, adaptation curves, main figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ class Results:
 
     @property
     def budgets(self) -> list[int]:
-        """Numbers of tries, ascending."""
+        """Numbers of interactions, ascending."""
         return sorted({row.budget for row in self.rows if row.budget > 0})
 
     @property
@@ -62,7 +62,7 @@ class Results:
         return bool(published(self.task, novel_categories=self.novel_categories))
 
     def row(self, method: str, budget: int) -> ResultRow | None:
-        """The row of a method at a budget; of those that try nothing, their only one will do."""
+        """The row of a method at a budget; methods without interactions have a single row."""
         own = [row for row in self.rows if row.method == method]
         exact = next((row for row in own if row.budget == budget), None)
         return own[0] if exact is None and own and method in WITHOUT_TRIES else exact
@@ -98,16 +98,16 @@ def read_results(path: Path, task: str = "", *, novel_categories: bool = False) 
 def results_section(results: Results) -> Section:
     """The table and the curves of the run's own evaluation."""
     lead: tuple[str, ...] = (
-        "F-score: whether the critic tells, at the threshold 0.5, which random interactions with unseen objects "
-        "succeed. Sample-success: whether what the adapted affordance chooses succeeds when it is executed where the "
-        "tries left the object, as in the paper; from the start: where they began, a state that all methods share. In "
-        "percent; the small figures are the limits of the 95% interval over objects. Bold: the best of a column, the "
-        "oracle left out, which is told the hidden facts.",
+        "F-score: of the critic at threshold 0.5, for the success of random interactions with unseen objects. "
+        "Sample-success: of the action that the adapted affordance chooses, executed in the state that the "
+        "interactions left, as in the paper; from the start: in the state in which they began, which all methods "
+        "share. In percent; the small figures are the limits of the 95% interval over objects. Bold: the best of a "
+        "column, without the oracle, which is given the hidden facts.",
     )
     if results.has_paper:
         lead += (
-            "In italics: the paper's own figures. Its objects, physics and random draws were others, so that orders "
-            "and trends can be compared, but not single figures.",
+            "In italics: the paper's own figures. Its objects, physics and random draws differ, so rankings and trends "
+            "can be compared, but not single figures.",
         )
     tables = (table_of(results), *like_for_like(results), details_of(results))
     return Section("results", "Methods and budgets", lead, tables=tables, drawings=(_curves(results),))
@@ -131,12 +131,12 @@ def tiles(results: Results) -> tuple[Tile, ...]:
     made, prior = results.row(BEST_METHOD, budget), results.row(PRIOR_METHOD, budget)
     shown = []
     if made is not None:
-        after = f"after {budget} tries" if budget != 1 else "after one try"
+        after = f"after {budget} interactions" if budget != 1 else "after one interaction"
         shown.append(Tile(percent(made.f_score), f"F-score of {BEST_METHOD} {after}"))
         shown.append(Tile(percent(made.sample_success), f"sample-success of {BEST_METHOD} {after}"))
     if prior is not None:
         without = f"{percent(prior.f_score)} / {percent(prior.sample_success)}"
-        shown.append(Tile(without, f"F-score / sample-success of {PRIOR_METHOD}, which tries nothing"))
+        shown.append(Tile(without, f"F-score / sample-success of {PRIOR_METHOD}, without interactions"))
     if made is not None and made.gap_closed is not None:
         label = f"of the gap in F-score between {PRIOR_METHOD} and the oracle closed"
         shown.append(Tile(f"{100 * made.gap_closed:.0f}%", label))
@@ -158,7 +158,7 @@ def table_of(results: Results, caption: str = "", measures: Mapping[Measure, str
     """Methods by budgets, beside the paper's."""
     columns = [(measure, budget) for measure in measures for budget in results.budgets]
     beside = {measure for measure in measures if results.has_paper and measure in STANDS_BESIDE}
-    second: Row = (Cell("tries", kind="name"),)
+    second: Row = (Cell("interactions", kind="name"),)
     for measure, budget in columns:
         second += (Cell(str(budget)), *([Cell("paper", kind="paper")] if measure in beside else []))
     body = []
@@ -207,18 +207,18 @@ def _curves(results: Results) -> Drawing:
         ]
         if paper:
             figure.add_trace(_paper_curve(paper).update(showlegend=column == 1), 1, column)
-    figure.update_xaxes(title_text="tries", tickmode="array", tickvals=[0, *results.budgets], range=[-0.3, None])
+    figure.update_xaxes(title_text="interactions", tickmode="array", tickvals=[0, *results.budgets], range=[-0.3, None])
     figure.update_yaxes(rangemode="tozero")
     laid_out(figure, 460, legend={"orientation": "h", "y": -0.3, "x": 0.5, "xanchor": "center"})
     return Drawing(
         figure,
-        "What tries teach. Level lines: what tries nothing, and the oracle. Bars: 95% intervals over objects. Click a "
-        "name to hide it; double-click to see it alone.",
+        "Results by number of interactions. Horizontal lines: methods without interactions, and the oracle. Bars: 95% "
+        "intervals over objects. Click a name to hide it; double-click to see it alone.",
     )
 
 
 def _level(results: Results, method: str, measure: Measure) -> go.Scatter | None:
-    """A line at the mean of what a method without tries reaches at all budgets."""
+    """A horizontal line at the mean of a method without interactions."""
     rows = [row for budget in results.budgets if (row := results.row(method, budget)) is not None]
     values = [value for row in rows if (value := row.value(measure)) is not None]
     if not values:

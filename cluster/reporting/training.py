@@ -20,7 +20,7 @@ MAX_STAGES = 40
 COLUMNS = 4
 ROW_HEIGHT = 230
 AFTER_TRIES = (("bce", "cross entropy (nats)"), ("f_score", "F-score"))
-"""What AAP's validation says after each number of tries, by the beginning of its name."""
+"""Validation measures of AAP that exist for each number of interactions, by the prefix of their names."""
 
 Entry = Mapping[str, float]
 """A line of metrics: the finite numbers in it, "step" among them."""
@@ -93,7 +93,7 @@ def curves_of(entries: Sequence[Entry]) -> Curve:
 
 
 def after_tries(entry: Entry, kind: str) -> list[tuple[int, float]]:
-    """What a validation measured after each number of tries, such as `bce_after_4`, by that number."""
+    """A measure of a validation by number of interactions, such as `bce_after_4`."""
     matches = ((re.fullmatch(rf"{kind}_after_([0-9]{{1,4}})", name), value) for name, value in entry.items())
     return sorted((int(match[1]), value) for match, value in matches if match)
 
@@ -148,7 +148,7 @@ def _drawing(curves: Mapping[str, Curve]) -> Drawing:
 
 
 def _adaptation(adapted: Mapping[str, Mapping[str, list[tuple[int, float]]]]) -> Drawing:
-    """What AAP knows of held-out objects after each number of random tries, at the end of each of its trainings."""
+    """Measures of AAP on held-out objects by number of random interactions, at the end of each training."""
     figure = make_subplots(1, 2, subplot_titles=[title for _, title in AFTER_TRIES], horizontal_spacing=0.09)
     for place, (stage, known) in enumerate(adapted.items()):
         for column, (kind, _) in enumerate(AFTER_TRIES, start=1):
@@ -161,9 +161,11 @@ def _adaptation(adapted: Mapping[str, Mapping[str, list[tuple[int, float]]]]) ->
                 mode="lines+markers",
                 line={"color": SEQUENCE[place % len(SEQUENCE)], "width": 2},
                 marker={"size": 7},
-                hovertemplate="%{x} tries: %{y:.3f}",
+                hovertemplate="%{x} interactions: %{y:.3f}",
             )
             figure.add_trace(trace, 1, column)
-    figure.update_xaxes(title_text="tries")
+    figure.update_xaxes(title_text="interactions")
     laid_out(figure, 340, showlegend=True, legend={"orientation": "h", "y": -0.25, "x": 0.5, "xanchor": "center"})
-    return Drawing(figure, "AAP's critic on held-out objects after so many random tries, at the end of its trainings.")
+    return Drawing(
+        figure, "AAP's critic on held-out objects by number of random interactions, at the end of each training."
+    )

@@ -1,4 +1,4 @@
-"""What the page calls things: hidden facts, outcomes, numbers of tries."""
+"""Texts of the page for hidden facts, outcomes and numbers of interactions."""
 
 from shared.hidden import hidden_parameter
 from shared.types import Direction, HiddenDynamics, Outcome
@@ -23,11 +23,11 @@ def turning(direction: Direction) -> str:
 
 
 def verdict(outcome: Outcome) -> str:
-    """What came of a try, in a few words."""
+    """The outcome of an interaction in a few words."""
     result = "success" if outcome.success else outcome.kind.value.replace("ok", "no success")
     return f"{result}, moved {outcome.motion:.3f}"
 
 
 def after(tries: int) -> str:
-    """When something is believed."""
-    return "before any try" if tries == 0 else "after 1 try" if tries == 1 else f"after {tries} tries"
+    """After how many interactions something holds."""
+    return "before any interaction" if tries == 0 else f"after {tries} interaction{'' if tries == 1 else 's'}"

@@ -33,8 +33,8 @@ def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say
     Args:
         run: a run with summary.json.
         config: its configuration.
-        experiments: whether to try hidden facts in the simulator, which takes some seconds more.
-        say: is told what is under way.
+        experiments: whether to simulate other hidden facts, which takes some more seconds.
+        say: receives a line for each step.
 
     Raises:
         StoreError: a file of the run is damaged or foreign.
@@ -94,12 +94,12 @@ def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Call
 
 def _not_tried(run: RunFolder) -> Section:
     name = run.path.resolve().name
-    how = f"Made by `adaafford report {name}`, which tries test objects under other hidden facts in the simulator."
+    how = f"Made by `adaafford report {name}`, which simulates test objects with other hidden facts."
     return Section("hidden-facts", "Affordance under hidden facts", (how,))
 
 
 def _picture(path: Path) -> Section:
-    caption = "Affordance before and after each try, as the camera sees it."
+    caption = "Affordance before and after each interaction, as the camera sees it."
     picture = Picture(read_bounded(path, MAX_PICTURE_BYTES), caption)
     return Section("glance", "At a glance", pictures=(picture,))
 
@@ -109,8 +109,8 @@ def _subtitle(summary: Mapping[str, Any], config: CampaignConfig, results: Resul
     minutes = summary["wall_seconds"] / 60
     workers = f"{config.workers} worker{'' if config.workers == 1 else 's'}"
     return (
-        f"Affordance that adapts to one object after a few tries: {summary['interactions']:,} interactions with "
-        f"{len(objects['train'])} objects, judged on {results.objects} others, in {minutes:.0f} minutes "
+        f"Affordance that adapts to one object after a few interactions: {summary['interactions']:,} interactions with "
+        f"{len(objects['train'])} objects, evaluated on {results.objects} others, in {minutes:.0f} minutes "
         f"(seed {config.seed}, {workers})."
     )
 

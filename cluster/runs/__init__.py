@@ -1,1 +1,1 @@
-"""Folders of runs, their log, and the processes that work in them: child processes, streams, log lines."""
+"""Folders of runs and their logs; child processes, standard streams and logging."""

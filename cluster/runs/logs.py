@@ -1,8 +1,8 @@
-"""What is logged: one line for people, or a JSON object a line for machines, which names rollout and worker.
+"""Logging: text lines for people, or JSON lines for programs, with rollout and worker.
 
     ADAAFFORD_LOG=json adaafford collect ... 2>log.jsonl
 
-Whoever logs gives what a line is about as `extra`, by the names in `FIELDS`; people get the message alone.
+A log call gives the subject of a line as `extra`, with the names in `FIELDS`; the text format has only the message.
 """
 
 import json
@@ -53,7 +53,7 @@ def configure(environment: Mapping[str, str]) -> None:
     """Set up logging of this process, to standard error.
 
     Args:
-        environment: ADAAFFORD_LOG=json asks for JSON lines, and for more of them.
+        environment: ADAAFFORD_LOG=json selects JSON lines, with more events.
     """
     as_json = environment.get(VARIABLE) == "json"
     handler = logging.StreamHandler()

@@ -1,20 +1,20 @@
-"""The folder of a run: what lies where, which configuration it belongs to, and what made it.
+"""The folder of a run: its files, its configuration, and the software that made it.
 
 RUN/
   config.json            resolved configuration, git commit, package versions; written once
-  places.json            where on this machine lies what is not in the run; leave it out where the run is published
-  objects.json           which objects were split how, and which were refused and why
+  places.json            paths of files outside the run on this machine; leave it out when you publish the run
+  objects.json           the split of the objects, and refused objects with reasons
   objects/               procedural objects, if no folder of objects was given
   store/                 the interactions, and the published policies
-  evaluation/            a second store: what was tried on unseen objects
+  evaluation/            a second store: the interactions with unseen objects
   training/<stage>/      checkpoints, metrics and output of each training stage
   log.jsonl              the run log: stages, times, results
-  summary.json           figures
-  affordance.png         one object before and after each try
-  report.html            all of it to look at, in one file
+  summary.json           results
+  affordance.png         one object before and after each interaction
+  report.html            all results on one page
 
-The folder may be renamed, moved or copied: nothing in it is found by an absolute path. Objects that lie elsewhere are
-known by their content, so that they may move, too (`adaafford resume RUN --objects FOLDER`).
+The folder may be renamed, moved or copied, because it contains no absolute paths. Objects outside it are identified by
+their content, so they may move, too (`adaafford resume RUN --objects FOLDER`).
 """
 
 import json
@@ -35,14 +35,14 @@ from shared.store.provenance import software_versions
 
 MAX_DOCUMENT_BYTES = 64 << 20
 PLACE_SETTINGS = ("objects", "object_list", "start_from", "splits.train_list", "splits.test_list", "ray_address")
-"""Settings that say where something is; config.json has their last parts alone, and places.json the rest."""
+"""Settings that are paths; config.json has only their last parts, and places.json has the whole paths."""
 
 
 class ObjectsUsed(StrictModel):
     """objects.json: the objects of a run."""
 
     folder: str
-    """What the folder is called; `RunFolder.objects_folder` finds it."""
+    """Name of the folder; `RunFolder.objects_folder` gives its path."""
     train: tuple[ObjectRef, ...]
     validation: tuple[ObjectRef, ...]
     test: tuple[ObjectRef, ...]
@@ -51,7 +51,7 @@ class ObjectsUsed(StrictModel):
 
     @property
     def all(self) -> tuple[ObjectRef, ...]:
-        """Those of all three parts."""
+        """The objects of all three sets."""
         return (*self.train, *self.validation, *self.test)
 
 
@@ -113,7 +113,7 @@ class RunFolder:
 
     @property
     def adopted(self) -> Path:
-        """The policy that the run went on from, if it did (`cluster.runs.warm_start`)."""
+        """The policy that the run started from, if there is one (`cluster.runs.warm_start`)."""
         return self.training("adopted")
 
     @property
@@ -122,30 +122,30 @@ class RunFolder:
         return self.path / "report.html"
 
     def are_novel(self, tested: Iterable[ObjectRef]) -> bool:
-        """Whether objects are of categories that nothing was trained on; of an adopted policy nobody knows."""
+        """Whether the objects have only categories that were not trained on; unknown for an adopted policy."""
         used = self.objects_used()
         learned_from = (ref.category for ref in (*used.train, *used.validation))
         return not self.adopted.is_dir() and {ref.category for ref in tested}.isdisjoint(learned_from)
 
     def training(self, stage: str) -> Path:
-        """What a training stage leaves."""
+        """The folder of a training stage."""
         return self.trainings / stage
 
     @property
     def trainings(self) -> Path:
-        """What all training stages leave."""
+        """The folder of all training stages."""
         return self.path / "training"
 
     @property
     def evaluations(self) -> Path:
-        """What `adaafford evaluate` leaves, a folder each."""
+        """The folder of the evaluations by `adaafford evaluate`."""
         return self.path / "evaluations"
 
     def objects_folder(self) -> Path:
-        """Where the run's objects lie: in the run, or where its user said last.
+        """The folder of the run's objects: in the run, or the last one that the user gave.
 
         Raises:
-            UsageError: they are not there any more.
+            UsageError: it does not exist any more.
         """
         named = _read_config(self).get("objects")
         folder = self.generated_objects.resolve() if named is None else Path(str(named))
@@ -159,24 +159,24 @@ class RunFolder:
         )
 
     def generates_objects(self) -> bool:
-        """Whether its objects are procedural ones of its own."""
+        """Whether its objects are procedural."""
         return _read_config(self).get("objects") is None
 
     def begun_with(self) -> dict[str, str]:
-        """Versions of the software that the run was begun with."""
+        """Software versions at the start of the run."""
         known = read_json(self.config).get("software")
         return {str(name): str(version) for name, version in known.items()} if isinstance(known, dict) else {}
 
     def objects_used(self) -> ObjectsUsed:
-        """What objects.json says."""
+        """The contents of objects.json."""
         return parse(ObjectsUsed, read_json(self.objects_file), str(self.objects_file))
 
 
 def begin(path: Path, config: CampaignConfig) -> RunFolder:
-    """Make the folder of a new run, or find the one that was begun with the same configuration.
+    """Create the folder of a new run, or open a run with the same configuration.
 
     Raises:
-        UsageError: the folder holds another run, or anything else.
+        UsageError: the folder has another run or other files.
     """
     run = RunFolder(path)
     settings = config.model_dump(mode="json")
@@ -184,7 +184,7 @@ def begin(path: Path, config: CampaignConfig) -> RunFolder:
     if path.exists() and not path.is_dir():
         raise UsageError(f"{path}: not a folder; name a new one")
     if not run.config.exists() and path.exists() and any(_foreign(path)):
-        raise UsageError(f"{path}: holds something that is no run; name a new or an empty folder")
+        raise UsageError(f"{path}: holds something that is not a run; name a new or an empty folder")
     path.mkdir(parents=True, exist_ok=True)
     if not run.config.exists():
         # First, since with config.json a run has begun.
@@ -215,7 +215,7 @@ def find(path: Path) -> tuple[RunFolder, CampaignConfig]:
 
 
 def note_places(run: RunFolder, config: CampaignConfig) -> None:
-    """Take note that what a run needs lies elsewhere now."""
+    """Record the new path of something that the run needs."""
     _write_places(run, config.model_dump(mode="json"))
 
 
@@ -259,7 +259,7 @@ def _with_settings(settings: Mapping[str, Any], values: Mapping[str, str | None]
 
 
 def _foreign(path: Path) -> list[Path]:
-    """What lies in a folder apart from hidden files and places.json, which a killed attempt may have left."""
+    """The files in a folder, without hidden files and places.json, which a killed attempt may have left."""
     own = RunFolder(path).places
     return [child for child in path.iterdir() if not child.name.startswith(".") and child != own]
 

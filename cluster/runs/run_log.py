@@ -36,7 +36,7 @@ Clock = Callable[[], float]
 
 
 class RunLog:
-    """Stages done and seconds spent, kept in RUN/log.jsonl."""
+    """Finished stages and their wall time, in RUN/log.jsonl."""
 
     def __init__(self, path: Path, clock: Clock = time.monotonic) -> None:
         """Read what earlier attempts wrote.
@@ -55,29 +55,29 @@ class RunLog:
 
     @property
     def finished(self) -> tuple[str, ...]:
-        """Stages that are done, in the order they ended."""
+        """Finished stages, in the order of their ends."""
         return tuple(self._results)
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Wall time of each stage over all attempts, in the order they began."""
+        """Wall time of each stage over all attempts, in the order of their starts, s."""
         return dict(self._seconds)
 
     @property
     def software(self) -> tuple[dict[str, str], ...]:
-        """Versions that attempts had, each set once, in the order of the attempts."""
+        """Software versions of the attempts, without repetitions, in order."""
         return tuple(self._software)
 
     def result(self, stage: str) -> dict[str, Any]:
-        """What a finished stage had to say."""
+        """The result of a finished stage."""
         return self._results[stage]
 
     def run(self, stages: Mapping[str, Callable[[], Mapping[str, Any]]], say: Callable[[str], None]) -> None:
-        """Run the stages that are not done yet, in order; each may be run again if a kill comes before its note.
+        """Run the unfinished stages in order; a stage may be repeated if a kill comes before its log entry.
 
         Args:
-            stages: what to do, by names that are the same in every attempt; each returns its result.
-            say: is told which stage begins, and which were done before.
+            stages: functions by name, the same names in every attempt; each returns its result.
+            say: receives a line for each stage that begins or was already done.
         """
         before = [name for name in stages if name in self._results]
         if before:
@@ -102,7 +102,7 @@ class RunLog:
     def stage(self, name: str) -> Iterator[Callable[[Mapping[str, Any]], None]]:
         """Time a stage; it counts as done only if the body hands its result to what this yields, and ends well.
 
-        >>> with ledger.stage("publish-1") as done:
+        >>> with run_log.stage("publish-1") as done:
         ...     done({"policy": store.publish_policy(1, files)})
         """
         earlier, begun = self._seconds.get(name, 0.0), self._clock()
@@ -164,7 +164,7 @@ class RunLog:
 
 
 def pause_s(spent_s: float) -> float:
-    """How long until the next heartbeat of a stage on which an attempt has spent so many seconds."""
+    """Seconds until the next heartbeat of a stage after this many seconds of an attempt."""
     return max(BEAT_S, BEAT_SHARE * spent_s)
 
 

@@ -1,7 +1,7 @@
-"""How a run or a store stands, from what lies on the disk or in the bucket alone: nobody who works there is asked.
+"""The status of a run or a store, read from files on the disk or in the bucket, without a request to its processes.
 
 snapshot = snapshot_of("RUN")        # or a store, or the folder of a learner
-standing.stores[0].driver            # what its driver wrote down last
+snapshot.stores[0].driver            # the last status of its driver
 """
 
 import json
@@ -30,13 +30,13 @@ MAX_TAIL_BYTES = 1 << 14
 
 @dataclass(frozen=True, slots=True)
 class WorkerNow:
-    """What a worker does at this moment.
+    """What a worker does now.
 
     Attributes:
-        process: its name, as `shared.io.files.process_name` has it.
-        host: where it runs; "" if the store does not know that.
+        process: its name, by `shared.io.files.process_name`.
+        host: its machine; "" if the store does not know it.
         shard_id: of its job.
-        rollout: the one under way; None while it writes, or waits for its next job.
+        rollout: the running rollout; None while it writes, or waits for its next job.
     """
 
     process: str
@@ -47,15 +47,15 @@ class WorkerNow:
 
 @dataclass(frozen=True, slots=True)
 class StoreSnapshot:
-    """How a store stands.
+    """The status of a store.
 
     Attributes:
         where: its folder or URL.
         rollouts: how many there are, by plan.
         policies: versions that are published.
-        driver: what the last collection said of itself; None if there was none.
-        driver_alive: whether it is at work.
-        workers: who executes what; a worker that was killed may be among them until the next collection begins.
+        driver: the status of the last collection; None if there was none.
+        driver_alive: whether that driver runs.
+        workers: the workers; a killed one may be among them until the next collection begins.
     """
 
     where: str
@@ -68,7 +68,7 @@ class StoreSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class TrainingSnapshot:
-    """The last line of metrics that a training wrote.
+    """The last line of a training's metrics.
 
     Attributes:
         stage: folder of the stage.
@@ -85,15 +85,15 @@ class TrainingSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class StatusSnapshot:
-    """How something stands.
+    """The status of a run, a store or a learner.
 
     Attributes:
         what: "run", "store" or "learner".
-        where: as it was named.
-        stages_done: of a run, in the order they ended.
-        stage: of a run, the one under way; None if there is none.
-        stage_s: seconds that it has taken, over all attempts.
-        stores: of a run, its two; of a store, itself.
+        where: the given folder or URL.
+        stages_done: finished stages of a run, in the order of their ends.
+        stage: the running stage of a run; None if there is none.
+        stage_s: seconds of that stage, over all attempts.
+        stores: the two of a run; or the store itself.
         training: of a run or a learner; None before the first validation.
     """
 
@@ -107,7 +107,7 @@ class StatusSnapshot:
 
 
 def snapshot_of(where: str, now: float | None = None) -> StatusSnapshot:
-    """How a run, a store or a learner stands.
+    """The status of a run, a store or a learner.
 
     Args:
         where: its folder, or the URL of a store.

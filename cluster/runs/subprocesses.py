@@ -1,4 +1,4 @@
-"""Child processes that share this one with neither Ray nor SAPIEN: what trains networks, and what judges a policy.
+"""Child processes without Ray and SAPIEN, for training and for evaluation of a policy.
 
     Child(say).run("learner.stages.jobs:run_from_json", {"job": ..., "config": ...}, out)
 
@@ -31,11 +31,11 @@ ENDED = "\x1e"
 
 
 class Child:
-    """A process that runs one function after another; it begins with the first, and anew after one that failed.
+    """A process that runs one function after another; it starts with the first, and again after a failure.
 
     Args:
-        say: is given each line that it prints, as it comes.
-        root: the run's folder, which may be published or moved; the folder of each call where none is given.
+        say: receives each line that the process prints.
+        root: the run's folder, which may be published or moved; default: the folder of each call.
     """
 
     def __init__(self, say: Callable[[str], None], root: Path | None = None) -> None:
@@ -44,12 +44,12 @@ class Child:
         self._process: subprocess.Popen[str] | None = None
 
     def run(self, function: str, arguments: Mapping[str, Any], out: Path) -> None:
-        """Call a function there, and wait until it has returned.
+        """Call a function in the process, and wait for its end.
 
         Args:
             function: "module:name" of one that returns nothing.
-            arguments: its arguments by name, as JSON has them.
-            out: folder that gets output.txt, everything that it printed, with paths relative to the root.
+            arguments: its arguments by name, as JSON.
+            out: folder for output.txt, with everything that it printed and with paths relative to the root.
 
         Raises:
             UsageError: it refused its input; its own line is the message.
@@ -74,7 +74,7 @@ class Child:
             raise
 
     def close(self) -> None:
-        """End it if it still runs: politely, then not."""
+        """End the process: by SIGTERM, then by SIGKILL."""
         process, self._process = self._process, None
         if process is None:
             return

@@ -1,4 +1,4 @@
-"""A policy that a campaign goes on from, instead of training one from nothing: fine-tuning on other objects.
+"""The warm start of a campaign from an existing policy, for fine-tuning on other objects.
 
 training/adopted/ of such a run is what the stages prior, aap-1 and aip-1 leave in others: a policy, the oracle that
 taught it, where there was one, and done.json, which says what objects it has seen.
@@ -70,4 +70,4 @@ def seen_by(source: str) -> frozenset[str]:
 
 def unknown(source: str) -> str:
     """What to tell of a policy that `seen_by` knows nothing of."""
-    return f"'{source}' does not say what objects it has learned from; it may be tested on some of them"
+    return f"'{source}' has no record of its training objects; some of them may be used for testing"

@@ -1,12 +1,11 @@
 """The job queue: which rollouts are made next, and under which plan.
 
     queue = RolloutQueue(lambda: plan, missing_ranges(100, done), per_shard=4)
-    while (order := queue.take()) is not None: ...
+    while (planned := queue.take()) is not None: ...
 
-A proposer makes a *series* of numbered rollouts, whichever versions of a policy it uses. Each number is handed out
-once, under the plan that is in force at that moment: always the same where a version was named, that of the newest
-version where the series follows a learner. All that tells rounds from continuous collection
-is how many rollouts a version may have.
+The rollouts of a proposer have one numbering over all versions of its policy. Each number is handed out once, under the
+current plan: the plan of the given version, or, if the collection follows a learner, that of the newest version. Rounds
+and continuous collection differ only in how many rollouts a version may have.
 """
 
 from collections import Counter
@@ -22,39 +21,39 @@ NOTHING: Mapping[str, int] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class PlannedJob:
-    """A job and its plan. A job that failed is tried again under the plan that it was handed out with."""
+    """A job and its plan; a retry keeps the plan."""
 
     plan: Plan
     job: Job
 
 
 class JobQueue(Protocol):
-    """Jobs that are made up as they are asked for."""
+    """Jobs that are created on demand."""
 
     @property
     def ended(self) -> bool:
-        """Whether there will be no more."""
+        """Whether no more jobs follow."""
         ...
 
     @property
     def any_done(self) -> bool:
-        """Whether some of what they are part of was done before."""
+        """Whether some of the rollouts were done before this attempt."""
         ...
 
     def take(self) -> PlannedJob | None:
-        """The next one; None where there is none, or none yet: `ended` tells which."""
+        """The next job; None if there is none, or none yet (see `ended`)."""
         ...
 
 
 class RolloutQueue:
-    """The rollouts of one proposer that are left to do.
+    """The missing rollouts of one proposer.
 
     Args:
-        plan_now: the plan in force; None while there is none, and all have to wait.
-        missing: numbers that are left to do, as half-open ranges.
+        plan_now: gives the current plan; None while there is none.
+        missing: numbers of the missing rollouts, as half-open ranges.
         per_shard: the most rollouts of one job.
-        per_plan: the most rollouts of one plan, after which the series waits for the next one; None: no bound.
-        held: how many rollouts of each plan, by its key, are there already.
+        per_plan: the most rollouts of one plan, after which the queue waits for the next plan; None: no limit.
+        held: how many rollouts the store already has of each plan, by the plan's key.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class RolloutQueue:
         self._handed_out = Counter(held)
         self.any_done = any(held.values())
         self.waiting = False
-        """Whether the last one that asked had to wait for another plan."""
+        """Whether the last call of `take` had to wait for another plan."""
 
     @property
     def ended(self) -> bool:
@@ -96,7 +95,7 @@ class RolloutQueue:
         return PlannedJob(plan, Job(plan.key, start, stop))
 
     def _most(self, plan: Plan) -> int:
-        """Rollouts that the next job of a plan may have."""
+        """The most rollouts of the next job of a plan."""
         if self._per_plan is None:
             return self._per_shard
         return min(self._per_shard, self._per_plan - self._handed_out[plan.key])

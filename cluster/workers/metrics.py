@@ -1,4 +1,4 @@
-"""What Prometheus sees of a worker group, through Ray's own exporter (its full installation, `ray[default]`, has one).
+"""Prometheus metrics of a worker group, through Ray's own exporter (in its full installation, `ray[default]`).
 
 Labels are few and fixed: task, proposer, outcome, stage, cause. None is ever an object, a rollout, a shard or a worker,
 of which there are millions.
@@ -25,7 +25,7 @@ Cause = Literal["fault", "loss", "growth"]
 
 
 class WorkerMetrics:
-    """Counters of one driver; they start at 0 with it, as Prometheus expects of a process."""
+    """Counters of one driver, which start at 0 with its process, as Prometheus expects."""
 
     def __init__(self, workers: int) -> None:
         of_plan = ("task", "proposer")

@@ -1,4 +1,4 @@
-"""Which policy proposes: one version that was named, or whichever is the newest that is published."""
+"""The policy that proposes: a given version, or always the newest published one."""
 
 import time
 from collections.abc import Callable
@@ -7,20 +7,20 @@ from shared.plan import Plan
 from shared.store import Store
 
 LOOK_S = 2.0
-"""How often a store is asked for newer policies: part of how old a policy may be that still proposes."""
+"""How often the store is searched for newer policies, s."""
 
 
 class PolicySource:
-    """The plan of one proposer at each moment; call it.
+    """The current plan of one proposer; call the object to get it.
 
-    A new policy takes effect within `LOOK_S` seconds of being published. What was handed out before
-    is still executed as it was: at most two jobs an actor, unless one of them fails and is tried again.
+    A new policy takes effect within `LOOK_S` seconds of its publication. Jobs that were handed out before, at most two
+    for each actor, and their retries are still executed with the old policy.
 
     Args:
         store: where policies are published.
-        proposer: who proposes.
-        version: the policy; None: always the newest.
-        adopt: is called with each plan before it is in force.
+        proposer: its name.
+        version: of the policy; None: always the newest.
+        announce: called with each new plan before it is used; gives its policy to the workers.
         clock: monotonic seconds.
     """
 
@@ -29,19 +29,19 @@ class PolicySource:
         store: Store,
         proposer: str,
         version: int | None,
-        adopt: Callable[[Plan], None],
+        announce: Callable[[Plan], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._store = store
         self._proposer = proposer
         self._version = version
-        self._adopt = adopt
+        self._announce = announce
         self._clock = clock
         self._looked = -LOOK_S
         self.plan: Plan | None = None
 
     def __call__(self) -> Plan | None:
-        """The plan in force; None while no policy is published.
+        """The current plan; None while no policy is published.
 
         Raises:
             StoreError: the policy is not in the store, or damaged.
@@ -49,7 +49,7 @@ class PolicySource:
         if self._version is None:
             self._look()
         elif self.plan is None:
-            self._take_up(self._version)
+            self._use(self._version)
         return self.plan
 
     def _look(self) -> None:
@@ -58,9 +58,9 @@ class PolicySource:
         self._looked = self._clock()
         newest = max(self._store.policy_versions(), default=0)
         if newest > (0 if self.plan is None else self.plan.policy_version):
-            self._take_up(newest)
+            self._use(newest)
 
-    def _take_up(self, version: int) -> None:
+    def _use(self, version: int) -> None:
         plan = Plan(setting=self._store.setting, proposer=self._proposer, policy_version=version)
-        self._adopt(plan)
+        self._announce(plan)
         self.plan = plan

@@ -1,7 +1,7 @@
-"""The worker group of Ray actors: bounded work in flight, dead and hung actors replaced, only job results coming back.
+"""The worker group of Ray actors: it submits jobs, receives job results, and replaces dead and hung actors.
 
-What the driver does for a shard does not depend on how many actors there are: answers call back by themselves, instead
-of being looked for among all that are expected, and slots are queued by state (`cluster.workers.slots`).
+The driver's cost of a shard does not depend on the number of actors: answers arrive by callbacks, so nothing polls all
+actors, and slots are queued by state (`cluster.workers.slots`).
 """
 
 import logging
@@ -31,40 +31,40 @@ from shared.plan import Job, Plan
 from shared.store.crash_log import CrashLog
 
 START_LIMIT_S = 120.0
-"""An actor's process imports an engine and PyTorch, which a busy machine or a cold disk may slow; no job's fault."""
+"""The start of an actor's process imports an engine and PyTorch, which is slow on a busy machine or a cold disk."""
 GRACE_S = 5.0
-"""What an actor's own watchdog, which leaves a traceback, has in advance of the driver, which cannot."""
-LOST = "its process was lost without a word: killed from outside, or for want of memory"
+"""The driver waits this much longer than the actor's own watchdog, because only the watchdog writes a traceback."""
+LOST = "its process was lost without a traceback: killed from outside, or out of memory"
 KEPT = 3
-"""Plans and policies that the object store holds; older ones were replaced, and only jobs that failed want them."""
+"""How many plans and policies stay in the object store; only retries of failed jobs still need older ones."""
 POLL_S = 1.0
-"""How often the driver looks for hung actors, however many job results come."""
+"""How often the driver looks for hung actors."""
 NODE_S = 2.0
-"""How often it looks, while actors are awaited, whether its own node lives: without it none may ever come."""
+"""How often the driver checks, while actors start, that its own node is alive; without the node none can start."""
 LOOK_S = 0.1
-"""How long it looks each time, at one after the other: a heartbeat in a bucket takes a request."""
+"""How long each search for hung actors may take: a heartbeat in a bucket costs a request."""
 
 logger = logging.getLogger(__name__)
 
 
 class Actor(Protocol):
-    """What a worker group asks of an actor; each answer comes later."""
+    """The interface of an actor to a worker group; each answer is a future."""
 
     def arrive(self) -> "Future[str]":
-        """The name of its process, once that is up."""
+        """The name of its process, when the process has started."""
         ...
 
     def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[JobResult]":
-        """See `collector.actor.WorkerActor.run`; executed in the order asked."""
+        """See `collector.actor.WorkerActor.run`; jobs are executed in the order of the calls."""
         ...
 
     def end(self) -> None:
-        """End it at once."""
+        """Kill the process."""
         ...
 
 
 class ProcessActor:
-    """An `Actor`: a process of its own, with one CPU. No restarts by Ray, which would run only `__init__` again."""
+    """An `Actor` in a separate process with one CPU; without restarts by Ray, which only repeat `__init__`."""
 
     def __init__(self, make_worker: WorkerFactory, crash_log: CrashLog, limits: Limits) -> None:
         actor: Any = ray.remote(num_cpus=1, max_restarts=0)(WorkerActor)
@@ -85,8 +85,8 @@ class ProcessActor:
         ray.kill(self._actor)
 
 
-class _Shelf:
-    """What actors pull when they first need it: the newest few, each put into Ray's object store once."""
+class _SharedObjects:
+    """The newest few plans or policies, each put into Ray's object store once; actors pull them when needed."""
 
     def __init__(self) -> None:
         self._kept: dict[Hashable, tuple[Any, Any]] = {}
@@ -102,12 +102,12 @@ class _Shelf:
         return kept[1]
 
     def get(self, key: Hashable) -> list[Any]:
-        """The reference, or nothing if there is none any more."""
+        """The reference in a list; an empty list if the value is no longer kept."""
         return [self._kept[key][1]] if key in self._kept else []
 
 
 class RayWorkerGroup:
-    """Actors of `collector.actor`, one CPU each, alive over all rounds. Needs a session (`cluster.workers.session`)."""
+    """Actors of `collector.actor`, one CPU each, alive over all rounds; needs a session (`cluster.workers.session`)."""
 
     def __init__(
         self,
@@ -117,13 +117,13 @@ class RayWorkerGroup:
         limits: Limits,
         call: Callable[[], Actor] | None = None,
     ) -> None:
-        """Start nothing yet: actors come up with the first jobs.
+        """Start nothing yet: actors start with the first jobs.
 
         Args:
             make_worker: makes the worker within an actor.
             crash_log: where actors leave their heartbeats.
             workers: how many actors.
-            limits: what a rollout may take; an actor that goes beyond is ended.
+            limits: time and memory of a rollout; an actor that exceeds them is ended.
             call: makes an actor; None: a process with a worker.
         """
         self.workers = workers
@@ -136,31 +136,31 @@ class RayWorkerGroup:
         self._slots = Slots(workers)
         self._in_flight = 0
         self._answered: SimpleQueue[Slot] = SimpleQueue()
-        self._plans, self._policies = _Shelf(), _Shelf()
+        self._plans, self._policies = _SharedObjects(), _SharedObjects()
         self._metrics = WorkerMetrics(workers)
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
         """See `WorkerGroup.load_policy`: one `ray.put`; actors pull it when a plan first needs it."""
         self._policies.put(version, dict(files))
 
-    def run(self, orders: JobQueue, on_result: Callable[[JobResult], None]) -> None:
+    def run(self, queue: JobQueue, on_result: Callable[[JobResult], None]) -> None:
         """See `WorkerGroup.run`."""
         retries = RetryPolicy(self.workers)
-        backlog = Backlog(orders, retries)
+        backlog = Backlog(queue, retries)
         try:
             while not backlog.ended or self._in_flight:
                 self._hand_out(backlog, retries)
                 for slot in self._wait():
-                    # An actor's answers are taken in the order of what was asked, in whichever they are announced; of
-                    # one that was dismissed some are announced that nobody waits for.
+                    # An actor's answers are taken in the order of its tasks, whatever the order of the callbacks. A
+                    # callback of a dismissed actor finds no task.
                     while slot.tasks and slot.tasks[0].answer.done():
                         self._take_in(slot, backlog, retries, on_result)
                 self._replace_hung(backlog, retries)
         finally:
-            # Only after a failure or an interrupt is anything left; what an actor would still commit is wanted by the
-            # next run anyway, but nobody would wait for it, so the actor goes.
+            # Jobs are left only after a failure or an interrupt. Nobody would wait for their results, so their actors
+            # are ended; the next run makes these rollouts again.
             for slot in self._slots:
-                if slot.orders:
+                if slot.planned_jobs:
                     self._dismiss(slot)
 
     def close(self) -> None:
@@ -169,7 +169,7 @@ class RayWorkerGroup:
             self._dismiss(slot)
 
     def _wait(self) -> Iterator[Slot]:
-        """Slots whose actors have answered, as soon as there is one; those that answer meanwhile come the next time."""
+        """Slots whose actors have answered; waits for the first. Later answers are returned by the next call."""
         timeout_s = self._poll_s if self._in_flight or self._slots.called else WAIT_S
         for _ in range(max(1, self._answered.qsize())):
             try:
@@ -178,48 +178,48 @@ class RayWorkerGroup:
                 return
 
     def _hand_out(self, backlog: Backlog, retries: RetryPolicy) -> None:
-        """Give actors that are up what they want, and call an actor for each order that has to wait.
+        """Submit jobs to the actors that are up, and start an actor for each job that has to wait.
 
-        An actor may start late or never (its machine may be gone), so no job waits for it.
+        An actor may start late or never (its machine may be gone), so no job waits for a particular actor.
 
         Args:
-            backlog: where they come from, and those that actors were called for go.
-            retries: knows what is not to be executed any more.
+            backlog: gives the jobs, and keeps those for which actors were started.
+            retries: knows the quarantined rollouts.
         """
         while (slot := self._slots.most_idle) is not None:
-            order = backlog.take(idle=not self._in_flight)
-            if order is None:
+            planned = backlog.take(idle=not self._in_flight)
+            if planned is None:
                 return
-            self._give(slot, order, retries)
+            self._give(slot, planned, retries)
         while (slot := self._slots.empty) is not None:
             if len(backlog) <= self._slots.called:
-                order = backlog.take_new(idle=not self._in_flight and not backlog)
-                if order is None:
+                planned = backlog.take_new(idle=not self._in_flight and not backlog)
+                if planned is None:
                     return
-                backlog.append(order)
+                backlog.append(planned)
             slot.actor, slot.busy_since = self._call(), time.monotonic()
             self._ask(slot, None, slot.actor.arrive())
 
-    def _give(self, slot: Slot, order: PlannedJob, retries: RetryPolicy) -> None:
-        """Submit an order to the slot's actor."""
+    def _give(self, slot: Slot, planned: PlannedJob, retries: RetryPolicy) -> None:
+        """Submit a job to the slot's actor."""
         if not slot.tasks:
             slot.busy_since = time.monotonic()
-        plan = self._plans.put(order.plan.key, order.plan)
-        # Of a version that is no longer kept, the worker reads the weights in the store.
-        policy = self._policies.get(order.plan.policy_version)
+        plan = self._plans.put(planned.plan.key, planned.plan)
+        # If a version is no longer kept here, the worker reads its weights from the store.
+        policy = self._policies.get(planned.plan.policy_version)
         self._in_flight += 1
-        self._ask(slot, order, slot.actor.run(plan, order.job, policy, retries.quarantined(order.job)))
+        self._ask(slot, planned, slot.actor.run(plan, planned.job, policy, retries.quarantined(planned.job)))
 
-    def _ask(self, slot: Slot, order: PlannedJob | None, answer: "Future[Any]") -> None:
-        """Take note of what an actor was asked."""
-        slot.tasks.append(Task(order, answer))
-        self._slots.file(slot)
+    def _ask(self, slot: Slot, planned: PlannedJob | None, answer: "Future[Any]") -> None:
+        """Add a task to the slot, and be called when its answer arrives."""
+        slot.tasks.append(Task(planned, answer))
+        self._slots.update(slot)
         answer.add_done_callback(lambda _: self._answered.put(slot))
 
     def _take_in(
         self, slot: Slot, backlog: Backlog, retries: RetryPolicy, on_result: Callable[[JobResult], None]
     ) -> None:
-        """Report the job result that has come for the slot's oldest task, or see to the failure."""
+        """Report the result of the slot's oldest task, or handle its failure."""
         task = slot.tasks[0]
         try:
             message = task.answer.result()
@@ -233,27 +233,27 @@ class RayWorkerGroup:
             words = self._crash_log.fault_of(slot.process) if slot.process else ""
             self._fail(slot, backlog, retries, Failure(words or LOST, None, fault=bool(words)))
             return
-        slot.settle()
-        if task.order is None:
+        slot.complete()
+        if task.planned is None:
             slot.process = message
             logger.info("a worker is up", extra={"worker": slot.process})
         else:
             self._in_flight -= 1
-            retries.reset(task.order.job)
-            self._note_done(slot, task.order.plan, message)
+            retries.reset(task.planned.job)
+            self._note_done(slot, task.planned.plan, message)
             self._retire_if_grown(slot, message)
         if slot.retiring and not slot.tasks:
             self._dismiss(slot)
             self._count_replaced("growth")
-        self._slots.file(slot)
-        if task.order is not None:
+        self._slots.update(slot)
+        if task.planned is not None:
             on_result(message)
 
     def _replace_hung(self, backlog: Backlog, retries: RetryPolicy) -> None:
-        """Replace actors that hang so thoroughly that not even their own watchdog ended them.
+        """Replace hung actors that their own watchdog did not end.
 
-        A rollout is over its limit when the driver has seen its heartbeat unchanged for so long by its own clock:
-        clocks of machines differ.
+        A rollout exceeds its limit when the driver has seen the same heartbeat for that long by the driver's clock,
+        because clocks of machines differ.
         """
         now = time.monotonic()
         if now - self._looked < self._poll_s:
@@ -262,7 +262,7 @@ class RayWorkerGroup:
         if self._slots.called and now - self._looked_at_node > NODE_S:
             self._looked_at_node = now
             _require_own_node()
-        for slot in self._slots.in_turn():
+        for slot in self._slots.round_robin():
             if time.monotonic() - now > LOOK_S:
                 return
             busy_s = now - slot.busy_since if slot.tasks else 0.0
@@ -277,19 +277,19 @@ class RayWorkerGroup:
         heartbeat, since = slot.look(self._crash_log)
         limit = START_LIMIT_S if heartbeat is None else self._limits.rollout_s + GRACE_S
         if time.monotonic() - since > limit:
-            # A process that is stopped does not hear Ray.
+            # A stopped process does not react to Ray.
             end_if_here(slot.process)
             reason = f"took more than {limit:g} s, and had to be killed"
             self._fail(slot, backlog, retries, Failure(reason, None, fault=True))
 
     def _call_again(self, slot: Slot, retries: RetryPolicy) -> None:
-        """Give up an actor that has not come; that others work means that a machine is missing, which may come back."""
+        """Give up an actor that did not start; if others run, only a machine is missing, and it may come back."""
         self._dismiss(slot)
         if not any(other.process for other in self._slots):
             retries.record_harmless(f"the start of its process took more than {START_LIMIT_S:g} s")
 
     def _note_done(self, slot: Slot, plan: Plan, job_result: JobResult) -> None:
-        """Tell log and metrics of a shard."""
+        """Write a committed shard to the log and the metrics."""
         self._metrics.add(plan, job_result)
         about = {"plan": plan.key, "policy": plan.policy_version, "shard": job_result.shard_id, "worker": slot.process}
         about |= {"interactions": job_result.interactions, "successes": job_result.successes}
@@ -297,7 +297,7 @@ class RayWorkerGroup:
         logger.info("shard %s is committed", job_result.shard_id, extra=about)
 
     def _retire_if_grown(self, slot: Slot, job_result: JobResult) -> None:
-        """Hand an actor no further jobs if its memory has grown by half of what it may grow by."""
+        """Submit no further jobs to an actor whose memory has grown by half of its limit."""
         if slot.first_mb is None:
             slot.first_mb = job_result.memory_mb
         grown_mb = job_result.memory_mb - slot.first_mb
@@ -309,54 +309,54 @@ class RayWorkerGroup:
     def _fail(
         self, slot: Slot, backlog: Backlog, retries: RetryPolicy, failure: Failure, *, in_rollout: bool = True
     ) -> None:
-        """Replace the slot's actor and put its jobs back in front; only what was under way is to blame.
+        """Replace the slot's actor, put its jobs back in front, and count the failure for the rollout that was running.
 
         Args:
             slot: whose actor failed.
-            backlog: takes the jobs back.
-            retries: decides what comes of them.
-            failure: how; which rollout was under way is found here.
-            in_rollout: whether that may be to blame.
+            backlog: receives the jobs.
+            retries: counts the failure.
+            failure: the failure; the rollout that was running is found here.
+            in_rollout: whether that rollout may be the cause.
         """
-        orders = slot.orders
+        planned_jobs = slot.planned_jobs
         heartbeat = self._crash_log.heartbeat_of(slot.process) if slot.process else None
         about = {"worker": slot.process, "rollout": heartbeat.rollout if heartbeat else None, "reason": failure.reason}
         logger.info("a worker is replaced: %s", failure.reason, extra=about)
         self._dismiss(slot)
         self._count_replaced("fault" if failure.fault else "loss")
-        if not orders:
+        if not planned_jobs:
             retries.record_harmless(failure.reason)
             return
-        jobs = [order.job for order in orders]
+        jobs = [planned.job for planned in planned_jobs]
         job = next((job for job in jobs if heartbeat is not None and heartbeat.shard_id == job.shard_id), jobs[0])
         known = heartbeat is not None and heartbeat.shard_id == job.shard_id and in_rollout
         retries.record_failure(
             job, replace(failure, rollout=heartbeat.rollout if known and heartbeat is not None else None)
         )
-        backlog.put_back(orders)
+        backlog.put_back(planned_jobs)
 
     def _count_replaced(self, cause: Cause) -> None:
         self.restarts += 1
         self._metrics.replaced(cause)
 
     def _dismiss(self, slot: Slot) -> None:
-        """End the slot's actor and forget what it was given and what it left."""
+        """End the slot's actor, drop its jobs, and remove its heartbeat and crash log."""
         if slot.actor is not None:
             slot.actor.end()
         if slot.process:
             self._crash_log.forget(slot.process)
-        self._in_flight -= len(slot.orders)
+        self._in_flight -= len(slot.planned_jobs)
         slot.clear()
-        self._slots.file(slot)
+        self._slots.update(slot)
 
 
 def _require_own_node() -> None:
-    """See that the node lives through which this process reaches Ray: its only one, if the session is our own.
+    """Check that the Ray node of this process is alive; in a session of our own it is the only node.
 
-    Ray itself takes a quarter of a minute to notice, and then ends this process without a word.
+    Ray notices its death only after a quarter of a minute, and then ends this process without a message.
 
     Raises:
-        WorkerError: it does not.
+        WorkerError: the node is dead.
     """
     own = ray.get_runtime_context().get_node_id()
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]

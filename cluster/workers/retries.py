@@ -1,13 +1,13 @@
 """Retries: jobs that failed are executed again, and rollouts that fail too often are quarantined.
 
-A *fault* is of the rollout's own making: its process crashed or hung, or it raised what no rollout may raise. A *loss*
-is a process that ended without a word: killed from outside, gone with its machine, or taken by the kernel for want of
-memory. Faults are deterministic, so few prove the case; losses happen to whoever is at work, so it takes many on one
-rollout before it is suspected, and workers that are killed at random change nothing in what is collected.
+A *fault* is caused by the rollout: its process crashed or hung, or it raised an unexpected exception. A *loss* is a
+process that ended without a traceback: it was killed from outside, its machine was lost, or the kernel was out of
+memory. Faults are deterministic, so a few suffice for quarantine. Losses can hit any running rollout, so one is only
+quarantined after many of them, and random kills of workers do not change the data.
 
-Quarantine is for rollouts, not for an environment in which none can succeed (a missing library, a full disk, a limit
-that is too low). So a rollout is only quarantined once another has succeeded after it failed: until then its job is
-kept back (`Backlog`), and where several rollouts fail alike meanwhile, the collection ends and none of them is stored.
+Quarantine is for rollouts, and not for an environment in which none can succeed (a missing library, a full disk, a
+limit that is too low). So a rollout is quarantined only after another rollout has succeeded. Until then its job is held
+back (`Backlog`). If several rollouts fail in the same way before that, the collection ends and stores none of them.
 """
 
 import logging
@@ -23,18 +23,18 @@ from shared.io.text import plain
 from shared.plan import Job
 
 MAX_FAULTS = 3
-"""Attempts that a rollout may fail by itself: one for its own sake, two against bad luck of a machine."""
+"""Faults of one rollout until it is quarantined; the retries exclude accidents of a machine."""
 MAX_LOSSES = 10
-"""Processes that may be lost over one rollout."""
+"""Losses in one rollout until it is quarantined."""
 MAX_ALIKE = 3
-"""Different rollouts that fail in the same way, at which the environment is suspected: with no success among them, or
-no more successes than failures in all."""
+"""Different rollouts with the same failure until the environment is taken for the cause: without a success in between,
+or with no more successes than such failures in total."""
 
 logger = logging.getLogger(__name__)
 
 
 class JobError(WorkerError):
-    """A job failed as often as it may, and no rollout of it is to blame.
+    """A job failed too often, and none of its rollouts is the cause.
 
     Attributes:
         job: the job.
@@ -47,12 +47,12 @@ class JobError(WorkerError):
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """An attempt at a job that failed.
+    """A failed attempt at a job.
 
     Attributes:
         reason: one line.
-        rollout: the one under way; None if none was.
-        fault: whether it is of the job's own making.
+        rollout: the one that was running; None if none was.
+        fault: whether the job caused it; otherwise it is a loss.
     """
 
     reason: str
@@ -98,7 +98,7 @@ class RetryPolicy:
         return {key[1]: self._quarantined[key] for key in keys if key in self._quarantined}
 
     def reset(self, job: Job) -> None:
-        """Take note that a job was done, so workers can live and rollouts can succeed."""
+        """Record a finished job: workers can start and rollouts can succeed."""
         self._idle_losses = 0
         self._note_success(job.stop - job.start - len(self.quarantined(job)))
 
@@ -108,14 +108,14 @@ class RetryPolicy:
             self._since_success.clear()
 
     def is_suspended(self, job: Job) -> bool:
-        """Whether a rollout of the job is to be quarantined, and none has succeeded since to make that believable."""
+        """Whether a rollout of the job is to be quarantined, and no rollout has succeeded since its failure."""
         return any((job.plan_key, rollout) in self._since_success for rollout in self.quarantined(job))
 
     def record_harmless(self, reason: str) -> None:
-        """Count a process that was lost before it was given a job.
+        """Count a process that was lost before it got a job.
 
         Raises:
-            WorkerError: so many were lost without a job being done meanwhile that none will live.
+            WorkerError: too many were lost without a finished job in between.
         """
         self._idle_losses += 1
         logger.warning("a worker was lost before it had a job (%s); trying again", reason, extra={"reason": reason})
@@ -123,10 +123,10 @@ class RetryPolicy:
             raise WorkerError(f"{self._idle_losses} workers were lost before they had a job; last: {reason}")
 
     def record_failure(self, job: Job, failure: Failure) -> None:
-        """Count a failure of `job`, which is tried again: without the culprit if that failed often enough.
+        """Count a failure of `job`, which is then executed again, without a rollout that failed too often.
 
         Raises:
-            JobError: it failed as often as it may, and not by one of its rollouts; or different rollouts fail alike.
+            JobError: it failed too often outside of its rollouts; or different rollouts fail in the same way.
         """
         self._counts[job, failure.rollout, failure.fault] += 1
         if failure.rollout is not None:
@@ -156,20 +156,20 @@ class RetryPolicy:
         if in_a_row >= MAX_ALIKE or alike >= max(MAX_ALIKE, self._succeeded):
             raise JobError(
                 job,
-                f"{max(in_a_row, MAX_ALIKE)} different rollouts failed in the same way ({failure.reason}), so that "
-                "this machine, a setting or an object is at fault; none of them is stored: mend it and give the same "
-                "command again, with --retry-quarantined if `adaafford store info` lists others",
+                f"{max(in_a_row, MAX_ALIKE)} different rollouts failed in the same way ({failure.reason}), so "
+                "this machine, a setting or an object is the cause; none of them is stored: correct it and give the "
+                "same command again, with --retry-quarantined if `adaafford store info` lists others",
             )
 
     def require_any_success(self, job: Job, *, ever: bool) -> None:
-        """See that a job that is all that is left has a rollout to execute, unless others have succeeded.
+        """Check that a rollout has succeeded before the last job is committed with quarantined rollouts only.
 
         Args:
-            job: that has rollouts to quarantine.
-            ever: whether rollouts have succeeded before this attempt.
+            job: the job, which has rollouts to quarantine.
+            ever: whether rollouts succeeded before this attempt.
 
         Raises:
-            JobError: nothing ever did.
+            JobError: no rollout ever succeeded.
         """
         given_up = self.quarantined(job)
         if not ever and not self._succeeded and len(given_up) == job.stop - job.start:
@@ -177,75 +177,75 @@ class RetryPolicy:
             raise JobError(
                 job,
                 f"no rollout succeeded, and rollout {rollout} failed again and again: {reason}; nothing was stored: "
-                "mend what it says and give the same command again",
+                "correct the cause and give the same command again",
             )
 
     def _charge_no_rollout(self, job: Job, failure: Failure, count: int) -> None:
         if failure.fault and count >= MAX_FAULTS:
             raise JobError(job, f"job {job.shard_id} failed {count} times; last: {failure.reason}")
-        # Whoever kills workers at random often meets one that is just starting, whichever job that is for.
+        # Random kills often hit a worker that is just starting; this says nothing about its job.
         self._idle_losses += not failure.fault
         if self._idle_losses >= self._most_idle_losses:
             raise JobError(job, f"job {job.shard_id} failed {self._idle_losses} times; last: {failure.reason}")
 
 
 def of_environment(error: BaseException) -> bool:
-    """Whether a library or a file cannot be had, which is no rollout's fault."""
+    """Whether a library or a file is missing, which no rollout causes."""
     return isinstance(error, OSError | ImportError)
 
 
 class Backlog:
-    """Jobs to hand out: those that failed first, then new ones, and last those with a rollout to quarantine.
+    """Jobs to hand out: first failed ones, then new ones, and last those with a rollout to quarantine.
 
     Args:
-        orders: the new ones.
+        queue: gives the new ones.
         retries: knows which rollouts are to be quarantined.
     """
 
-    def __init__(self, orders: JobQueue, retries: RetryPolicy) -> None:
-        self._orders = orders
+    def __init__(self, queue: JobQueue, retries: RetryPolicy) -> None:
+        self._queue = queue
         self._retries = retries
         self._again: deque[PlannedJob] = deque()
         self._suspended: deque[PlannedJob] = deque()
 
     def __len__(self) -> int:
-        """How many are to be handed out at once."""
+        """How many failed or waiting jobs are to be handed out next."""
         return len(self._again)
 
     @property
     def ended(self) -> bool:
-        """Whether there will be no more, unless one that is handed out comes back."""
-        return not self._again and not self._suspended and self._orders.ended
+        """Whether no more jobs follow, unless one that is in flight fails."""
+        return not self._again and not self._suspended and self._queue.ended
 
-    def append(self, order: PlannedJob) -> None:
-        """Add an order to those that are to be handed out at once."""
-        self._again.append(order)
+    def append(self, planned: PlannedJob) -> None:
+        """Add a job to those that are handed out next."""
+        self._again.append(planned)
 
-    def put_back(self, orders: Sequence[PlannedJob]) -> None:
-        """Take back orders that failed, in front of the others."""
-        for order in reversed(orders):
-            (self._suspended if self._retries.is_suspended(order.job) else self._again).appendleft(order)
+    def put_back(self, planned_jobs: Sequence[PlannedJob]) -> None:
+        """Take back failed jobs, in front of the others."""
+        for planned in reversed(planned_jobs):
+            (self._suspended if self._retries.is_suspended(planned.job) else self._again).appendleft(planned)
 
     def take(self, *, idle: bool) -> PlannedJob | None:
-        """The next one; None where there is none, or none yet.
+        """The next job; None if there is none, or none yet.
 
         Args:
-            idle: whether nothing is under way that could still succeed.
+            idle: whether no job is in flight that could still succeed.
 
         Raises:
-            JobError: all that is left would be quarantined, and no rollout ever succeeded.
+            JobError: all remaining rollouts would be quarantined, and none ever succeeded.
         """
         return self._again.popleft() if self._again else self.take_new(idle=idle)
 
     def take_new(self, *, idle: bool) -> PlannedJob | None:
-        """The next one behind those that are to be handed out at once; see `take`."""
+        """The next job after those that failed or wait; see `take`."""
         if self._suspended and not self._retries.is_suspended(self._suspended[0].job):
             return self._suspended.popleft()
-        order = self._orders.take()
-        if order is None and self._suspended and idle:
-            self._retries.require_any_success(self._suspended[0].job, ever=self._orders.any_done)
+        planned = self._queue.take()
+        if planned is None and self._suspended and idle:
+            self._retries.require_any_success(self._suspended[0].job, ever=self._queue.any_done)
             return self._suspended.popleft()
-        return order
+        return planned
 
 
 def describe(error: BaseException) -> str:

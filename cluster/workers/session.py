@@ -57,8 +57,8 @@ _SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 _SHARED_MEMORY = Path("/dev/shm")  # noqa: S108
 _OWNER_FILE = "owner"
 
-FleetMaker = Callable[[WorkerFactory, CrashLog], WorkerGroup]
-"""Makes a worker group whose workers leave their heartbeats there."""
+WorkerGroupMaker = Callable[[WorkerFactory, CrashLog], WorkerGroup]
+"""Makes a worker group from a worker factory and the crash log for its heartbeats."""
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ logger = logging.getLogger(__name__)
 class Crew:
     """The live worker group: one at a time, since each worker holds a CPU; kept as long as the store stays the same."""
 
-    def __init__(self, make_worker_group: FleetMaker) -> None:
+    def __init__(self, make_worker_group: WorkerGroupMaker) -> None:
         self._make_worker_group = make_worker_group
         self._worker_group: WorkerGroup | None = None
         self._of: tuple[str, Path] | None = None
@@ -87,7 +87,7 @@ class Crew:
 
 
 @contextmanager
-def worker_groups(workers: int, limits: Limits, address: str | None = None) -> Iterator[FleetMaker]:
+def worker_groups(workers: int, limits: Limits, address: str | None = None) -> Iterator[WorkerGroupMaker]:
     """A maker of worker groups that live at most as long as the context: serial if `workers` is 0, else on Ray.
 
     Ray starts with the first worker group, so that what needs none does not wait for it.

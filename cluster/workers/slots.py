@@ -1,6 +1,6 @@
-"""Slots of a worker group: each holds one actor and the jobs that it was given.
+"""Slots of a worker group: each holds one actor and the jobs that were submitted to it.
 
-Slots are queued by state, so every operation takes the same time however many slots there are.
+Slots are queued by state, so every operation is O(1) in the number of slots.
 """
 
 import time
@@ -14,74 +14,74 @@ from cluster.workers.job_queue import PlannedJob
 from shared.store.crash_log import CrashLog, Heartbeat
 
 IN_FLIGHT = 2
-"""Jobs an actor holds: one under way, one that waits so that the actor never idles for the driver's sake."""
+"""Jobs in flight for each actor: one is executed, and one waits so that the actor is never idle."""
 
 
 @dataclass(slots=True, eq=False)
 class Task:
-    """What an actor was asked: to arrive, or to execute an order.
+    """A request to an actor: to start, or to execute a job.
 
     Attributes:
-        order: None if it is to arrive.
-        answer: its process's name, or the job result.
+        planned: the job; None for the start.
+        answer: the name of its process, or the job result.
     """
 
-    order: PlannedJob | None
+    planned: PlannedJob | None
     answer: "Future[Any]"
 
 
 @dataclass(slots=True, eq=False)
 class Slot:
-    """A place for one actor, and what it was asked, oldest first."""
+    """One actor, if it has been started, and its tasks, oldest first."""
 
     actor: Any = None
-    """None: the place is empty."""
+    """None: the slot is empty."""
     process: str = ""
-    """By which name its heartbeats go; "" until it is up."""
+    """The name of its process, which is also that of its heartbeats; "" until the process has started."""
     tasks: deque[Task] = field(default_factory=deque)
     busy_since: float = 0.0
-    """When the actor was called, or the oldest task came to the head; `time.monotonic`."""
+    """Since when the actor starts, or its oldest task is executed; `time.monotonic`."""
     seen: tuple[Heartbeat | None, float] | None = None
-    """The last heartbeat that was looked at, and since when it has been the same."""
+    """The last heartbeat that was read, and since when it has not changed."""
     first_mb: float | None = None
-    """What the process held after its first job."""
+    """Memory of the process after its first job, MB."""
     retiring: bool = False
-    """Whether it is only to finish what it has."""
+    """Whether the actor gets no further jobs."""
 
     @property
-    def orders(self) -> list[PlannedJob]:
-        """What it holds, oldest first."""
-        return [task.order for task in self.tasks if task.order is not None]
+    def planned_jobs(self) -> list[PlannedJob]:
+        """The jobs in flight, oldest first."""
+        return [task.planned for task in self.tasks if task.planned is not None]
 
-    def settle(self) -> None:
-        """Strike out the oldest task; the next one comes to the head."""
+    def complete(self) -> None:
+        """Remove the oldest task."""
         self.tasks.popleft()
         self.busy_since, self.seen = time.monotonic(), None
 
     def look(self, crash_log: CrashLog) -> tuple[Heartbeat | None, float]:
-        """The heartbeat of the rollout under way, and since when it has been seen unchanged."""
+        """The heartbeat of the running rollout, and since when it has not changed."""
         heartbeat = crash_log.heartbeat_of(self.process)
         if self.seen is None or self.seen[0] != heartbeat:
             self.seen = heartbeat, time.monotonic()
         return self.seen
 
     def clear(self) -> None:
-        """Forget the actor and all that was about it."""
+        """Make the slot empty."""
         self.actor = self.seen = self.first_mb = None
         self.process, self.retiring = "", False
         self.tasks.clear()
 
 
 class Slots:
-    """All slots, queued by state; call `file` after each change of a slot."""
+    """All slots, queued by state; call `update` after each change of a slot."""
 
     def __init__(self, count: int) -> None:
         self._all = [Slot() for _ in range(count)]
-        # Unlike a plain dict's, its first entry is found at once, however many before that were removed.
+        # In an OrderedDict the first entry is found in O(1) after removals, unlike in a dict.
         self._empty = OrderedDict[Slot, None].fromkeys(self._all)
         self._called = OrderedDict[Slot, None]()
         self._idle = tuple(OrderedDict[Slot, None]() for _ in range(IN_FLIGHT))
-        """By how many jobs they hold."""
+        """One queue for each number of jobs in flight."""
         self._next_look = 0
 
     def __iter__(self) -> Iterator[Slot]:
@@ -89,7 +89,7 @@ class Slots:
 
     @property
     def called(self) -> int:
-        """How many actors are on their way."""
+        """How many actors are starting."""
         return len(self._called)
 
     @property
@@ -99,13 +99,13 @@ class Slots:
 
     @property
     def most_idle(self) -> Slot | None:
-        """A slot that may be given a job; none gets a second one while another has none."""
+        """A slot with the fewest jobs that may get one; None if all are busy."""
         return next((slot for idle in self._idle for slot in idle), None)
 
-    def file(self, slot: Slot) -> None:
-        """Queue a slot by its present state."""
-        for drawer in (self._empty, self._called, *self._idle):
-            drawer.pop(slot, None)
+    def update(self, slot: Slot) -> None:
+        """Put a slot into the queue of its present state."""
+        for queue in (self._empty, self._called, *self._idle):
+            queue.pop(slot, None)
         if slot.actor is None:
             self._empty[slot] = None
         elif not slot.process:
@@ -113,8 +113,8 @@ class Slots:
         elif not slot.retiring and len(slot.tasks) < IN_FLIGHT:
             self._idle[len(slot.tasks)][slot] = None
 
-    def in_turn(self) -> Iterator[Slot]:
-        """Each slot once; whoever stops early is given the next ones another time."""
+    def round_robin(self) -> Iterator[Slot]:
+        """Each slot once, beginning where the last iteration stopped."""
         for _ in self._all:
             slot = self._all[self._next_look]
             self._next_look = (self._next_look + 1) % len(self._all)

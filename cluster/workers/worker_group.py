@@ -1,11 +1,11 @@
-"""Worker groups: whoever executes the jobs of a plan. The serial one here, the Ray one in `cluster.workers.ray_group`.
+"""Worker groups, which execute jobs: the serial one here, and the one of Ray actors in `cluster.workers.ray_group`.
 
-    fleet.load_policy(1, files)                    # once a version
-    worker_group.run(queue, on_result=print)           # any number of times, on the same live workers
-    fleet.close()
+    worker_group.load_policy(1, files)          # once for each version
+    worker_group.run(queue, on_result=print)    # any number of times, on the same live workers
+    worker_group.close()
 
-Jobs are idempotent by their shard: a worker that finds its shard committed does nothing. So a job may be submitted
-again after any failure, and at-least-once delivery is enough.
+A job is idempotent: a worker does nothing if the shard of the job is already committed. So a job may be submitted again
+after any failure, and at-least-once delivery is enough.
 """
 
 import logging
@@ -20,15 +20,15 @@ from collector.job_result import JobResult, JobWorker, WorkerFactory
 from shared.errors import AdaAffordError
 
 WAIT_S = 0.5
-"""How often a worker group that has nothing to do asks for orders."""
+"""How often an idle worker group asks for jobs."""
 
 logger = logging.getLogger(__name__)
 
 
 def make_worker(store: str | Path, objects: Path) -> JobWorker:
-    """Make a `collector.worker.Worker` in the process that calls; `partial` of this is a `WorkerFactory`.
+    """Make a `collector.worker.Worker` in the calling process; a `partial` of this is a `WorkerFactory`.
 
-    The engine is imported here and not by the driver, which needs none where Ray's actors do the work.
+    The engine is imported here, because the driver of Ray actors does not need it.
     """
     from collector.worker import Worker
 
@@ -39,36 +39,36 @@ class WorkerGroup(Protocol):
     """Executes jobs on some number of workers."""
 
     workers: int
-    """How many work at the same time."""
+    """How many workers run at the same time."""
     restarts: int
     """How many workers were replaced so far."""
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
-        """Hand the weights of policy `version` to every worker, present and future."""
+        """Give the weights of policy `version` to all present and future workers."""
         ...
 
-    def run(self, orders: JobQueue, on_result: Callable[[JobResult], None]) -> None:
-        """Execute `orders` until they have ended, in any order, and report each once.
+    def run(self, queue: JobQueue, on_result: Callable[[JobResult], None]) -> None:
+        """Execute the jobs of `queue` until it has ended, in any order, and report each result once.
 
-        They are taken no earlier than somebody is free for them, and asked for again where there is none yet. A rollout
-        that fails again and again is given up and recorded as quarantined; see `cluster.workers.retries`.
+        A job is taken from the queue only when a worker is free. If the queue has none yet, it is asked again later. A
+        rollout that fails repeatedly is quarantined; see `cluster.workers.retries`.
 
         Raises:
-            JobError: a job failed again and again, and no rollout of it was to blame.
-            AdaAffordError: a worker met a problem that the user must solve; it is not tried again.
+            JobError: a job failed repeatedly, and none of its rollouts was the cause.
+            AdaAffordError: a worker met a problem that the user must solve; there is no retry.
         """
         ...
 
     def close(self) -> None:
-        """End the workers; whatever was not committed is lost, and nothing else is."""
+        """End the workers; only rollouts that are not committed are lost."""
         ...
 
 
 class SerialWorkerGroup:
-    """One worker in this very process, without Ray: the same code for debugging, tests and tiny machines.
+    """One worker in this process, without Ray, for debugging, tests and small machines.
 
-    Rollouts that raise are quarantined as everywhere. One that crashes ends this process, and one that hangs is waited
-    for, as in any program that is debugged; a worker group of processes survives both.
+    Rollouts that raise are quarantined as usual. One that crashes ends this process, and one that hangs blocks it; a
+    worker group of processes survives both.
     """
 
     workers = 1
@@ -85,16 +85,16 @@ class SerialWorkerGroup:
         if self._worker is not None:
             self._worker.load_policy(version, files)
 
-    def run(self, orders: JobQueue, on_result: Callable[[JobResult], None]) -> None:
+    def run(self, queue: JobQueue, on_result: Callable[[JobResult], None]) -> None:
         """See `WorkerGroup.run`."""
         retries = RetryPolicy()
-        backlog = Backlog(orders, retries)
+        backlog = Backlog(queue, retries)
         while not backlog.ended:
-            order = backlog.take(idle=True)
-            if order is None:
+            planned = backlog.take(idle=True)
+            if planned is None:
                 time.sleep(WAIT_S)
-            elif (job_result := self._run(order, retries)) is None:
-                backlog.put_back([order])
+            elif (job_result := self._run(planned, retries)) is None:
+                backlog.put_back([planned])
             else:
                 on_result(job_result)
 
@@ -102,12 +102,12 @@ class SerialWorkerGroup:
         """See `WorkerGroup.close`."""
         self._worker = None
 
-    def _run(self, order: PlannedJob, retries: RetryPolicy) -> JobResult | None:
-        """Try a job; None if it failed, which takes a fresh worker the next time."""
-        job = order.job
+    def _run(self, planned: PlannedJob, retries: RetryPolicy) -> JobResult | None:
+        """Execute a job; None if it failed. The next job then gets a new worker."""
+        job = planned.job
         rollouts: list[int | None] = [None]
         try:
-            job_result = self._live_worker().run(order.plan, job, retries.quarantined(job), rollouts.append)
+            job_result = self._live_worker().run(planned.plan, job, retries.quarantined(job), rollouts.append)
         except AdaAffordError:
             raise
         except Exception as error:
@@ -120,7 +120,7 @@ class SerialWorkerGroup:
         return job_result
 
     def _live_worker(self) -> JobWorker:
-        """The worker, made and given all policies if there is none yet."""
+        """The worker; it is created with all policies if there is none yet."""
         if self._worker is None:
             self._worker = self._make_worker()
             for version, files in self._policies.items():

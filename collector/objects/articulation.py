@@ -1,7 +1,7 @@
 """An articulated object as the scene and the camera need it: rigid bodies joined by moving joints.
 
 Links that a fixed joint ties together are one body. Body 0 is the static root; body k >= 1 is the k-th movable part
-and hangs on its parent by exactly one moving joint, parents before children.
+and is connected to its parent by exactly one moving joint; parents come before children.
 """
 
 from dataclasses import dataclass
@@ -29,12 +29,12 @@ class Mesh:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """The moving joint that a part hangs on."""
+    """The moving joint of a part."""
 
     name: str
     kind: Literal["revolute", "prismatic"]
     parent: int
-    """Body that it hangs on."""
+    """Index of the parent body."""
     parent_from_body: Float
     """[4, 4], pose of the body's frame in its parent's at joint position 0; the axis passes through its origin."""
     axis: Float
@@ -130,7 +130,7 @@ def joint_twist(joint: Joint, world_from_body: Float) -> Float:
     """(w, v), [6], world frame: a point p of the body starts to move by w x p + v a unit of joint position.
 
     Args:
-        joint: that the body hangs on.
+        joint: of the body.
         world_from_body: [4, 4], the body's pose; the axis passes through its origin.
     """
     axis = world_from_body[:3, :3] @ joint.axis

@@ -1,4 +1,4 @@
-"""Bounds on objects that the engine and the scene can take; beyond them it is slow, wrong, or ends the process."""
+"""Bounds on objects for the engine and the scene; beyond them it is slow, wrong, or crashes."""
 
 from collections.abc import Sequence
 
@@ -28,7 +28,7 @@ def check_bounds(bodies: Sequence[Body]) -> None:
         bodies: the root, then the parts, parents before children.
 
     Raises:
-        ObjectError: with one line that says which bound, and by how much.
+        ObjectError: with one line that has the bound and the value.
     """
     parts = len(bodies) - 1
     if parts > MAX_PARTS:

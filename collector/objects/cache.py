@@ -1,4 +1,4 @@
-"""Objects that a worker keeps in memory, since reading one takes longer than several interactions with it."""
+"""A cache of objects in memory, because reading an object takes longer than several interactions with it."""
 
 from collections import OrderedDict
 from pathlib import Path
@@ -13,11 +13,11 @@ MOST_BYTES = 256 << 20
 
 
 class ObjectCache:
-    """The objects of one folder, read when they are first asked for; those unused for longest make room.
+    """The objects of one folder, read on demand; the least recently used ones are dropped.
 
     Args:
         folder: of the objects.
-        most_bytes: of meshes to keep; the object that was asked for last stays, however large it is.
+        most_bytes: of meshes to keep; the last object is kept in any case.
     """
 
     def __init__(self, folder: Path, most_bytes: int = MOST_BYTES) -> None:
@@ -27,7 +27,7 @@ class ObjectCache:
         self._bytes = 0
 
     def load(self, ref: ObjectRef, collision: Collision) -> ArticulatedObject:
-        """An object, as its reference knows it.
+        """The object of a reference.
 
         Raises:
             ObjectError: see `collector.objects.catalogue.load_ref`.
@@ -44,6 +44,6 @@ class ObjectCache:
 
 
 def mesh_bytes(target: ArticulatedObject) -> int:
-    """What an object's meshes take in memory, each counted once."""
+    """Memory of an object's meshes, each counted once, bytes."""
     meshes = {id(mesh): mesh for body in target.bodies for mesh in (*body.visuals, *body.collisions)}
     return sum(mesh.vertices.nbytes + mesh.faces.nbytes for mesh in meshes.values())

@@ -1,4 +1,4 @@
-"""The objects of a folder: which can be used, which cannot and why, which suit a task, and how they are split.
+"""The objects of a folder: usable and refused ones, those that suit a task, and their split.
 
 A catalogue keeps a few words an object; geometry is read when it is wanted (`load`).
 """
@@ -42,7 +42,7 @@ class CatalogueEntry:
 
     @property
     def movable(self) -> int:
-        """How many parts can move."""
+        """Number of movable parts."""
         return sum(part.span > MIN_RANGE for part in self.parts)
 
 
@@ -72,11 +72,11 @@ def scan(path: Path, *object_lists: Path, anew: bool = False) -> Catalogue:
 
     Args:
         path: a folder of object folders, or one object's folder. Files and hidden folders in it are ignored.
-        object_lists: Where2Act lists, `<id> <category>` a line; where there are any, only their objects are looked at.
+        object_lists: Where2Act lists, `<id> <category>` a line; if given, only their objects are used.
         anew: read all of them, whatever is known.
 
     Raises:
-        UsageError: `path` or a list cannot be read, or there is no object at all.
+        UsageError: `path` or a list cannot be read, or there is no object.
     """
     folders = _object_folders(path)
     if object_lists:
@@ -119,7 +119,7 @@ def load(entry: CatalogueEntry) -> ArticulatedObject:
     """The object's geometry.
 
     Raises:
-        ObjectError: its files cannot be read, or are not those that were catalogued.
+        ObjectError: its files cannot be read, or have changed since the scan.
     """
     return _load(entry.folder, entry.tree, entry.ref)
 
@@ -130,10 +130,10 @@ def load_ref(path: Path, ref: ObjectRef, collision: Collision = "hulls") -> Arti
     Args:
         path: the folder.
         ref: which object.
-        collision: whether its collision meshes are taken as they are, or decomposed first.
+        collision: whether its collision meshes are used unchanged, or are decomposed first.
 
     Raises:
-        ObjectError: there is none, its files are not those that `ref` was made from, or it cannot be decomposed.
+        ObjectError: it is missing, its files have changed, or it cannot be decomposed.
     """
     loaded = _load(path / ref.id if reader_of(path) is None else path.resolve(), path, ref)
     if collision == "hulls":
@@ -148,7 +148,7 @@ def for_task(catalogue: Catalogue, task: Task) -> Catalogue:
 
 
 def of_categories(catalogue: Catalogue, categories: Collection[str]) -> Catalogue:
-    """The catalogue in which only objects of some categories are usable; of any where none is named."""
+    """The catalogue in which only objects of some categories are usable; all categories if none is given."""
 
     def reason(entry: CatalogueEntry) -> str | None:
         if not categories or entry.ref.category in categories:
@@ -159,7 +159,7 @@ def of_categories(catalogue: Catalogue, categories: Collection[str]) -> Catalogu
 
 
 def qualifying_parts(described: CatalogueEntry | ArticulatedObject, task: Task) -> tuple[int, ...]:
-    """The parts (1-based) that `task` may act on: visible, able to move, and of the kind that it names."""
+    """The parts (1-based) that `task` may act on: visible, movable, and with the task's part names."""
     if task.categories and described.ref.category not in task.categories:
         return ()
     parts = described.parts if isinstance(described, CatalogueEntry) else described.summaries()
@@ -169,12 +169,12 @@ def qualifying_parts(described: CatalogueEntry | ArticulatedObject, task: Task) 
 def split(refs: Iterable[ObjectRef], fractions: tuple[float, float, float], seed: int) -> ObjectSplit:
     """Split objects into train, validation and test, each category alike: a pure function of its arguments.
 
-    Each set whose fraction is not zero gets an object wherever there are as many objects as such sets.
+    Each set with a positive fraction gets an object if there are enough objects.
 
     Args:
         refs: in any order.
         fractions: of train, validation and test; non-negative, and they sum to 1.
-        seed: decides which objects go where.
+        seed: of the split.
 
     Raises:
         UsageError: the fractions are negative or do not sum to 1.
@@ -223,7 +223,7 @@ def _load(folder: Path, tree: Path, ref: ObjectRef) -> ArticulatedObject:
     if loaded.ref != ref:
         raise ObjectError(
             f"{folder}: is not the object that was planned ({loaded.ref.id} {loaded.ref.content_hash[:12]} instead of "
-            f"{ref.id} {ref.content_hash[:12]}); restore its files or start anew"
+            f"{ref.id} {ref.content_hash[:12]}); restore its files or start another run"
         )
     return loaded
 

@@ -37,10 +37,10 @@ SLACK = 0.1
 
 
 class Decomposer:
-    """Decomposes objects; a context that ends the process it may have started.
+    """Decomposes objects in a child process; a context manager that ends this process.
 
     Args:
-        cache: folder of the cache; made where missing.
+        cache: folder of the cache, created if missing.
 
     Example:
         >>> with Decomposer(cache_folder("pieces")) as decomposer:
@@ -69,7 +69,7 @@ class Decomposer:
 
         Args:
             target: the object.
-            progress: called with how many meshes are done, and how many there are.
+            progress: called with the number of finished meshes and the total.
 
         Raises:
             ObjectError: a mesh is too large, takes too long or ends the library, or there are too many pieces.
@@ -95,7 +95,7 @@ class Decomposer:
         return dataclasses.replace(target, bodies=tuple(bodies))
 
     def pieces(self, mesh: Mesh) -> tuple[Mesh, ...]:
-        """The convex pieces of one mesh; the mesh itself where one piece is enough.
+        """The convex pieces of one mesh; the mesh itself if one piece is enough.
 
         Raises:
             ObjectError: it is too large, takes too long or ends the library.

@@ -1,4 +1,4 @@
-"""Reading the files of an object's folder, which came from outside: regular, small enough, and in their place."""
+"""Reading of untrusted files of an object: only regular files of bounded size within the folder of objects."""
 
 import hashlib
 import os
@@ -21,13 +21,13 @@ _POINTERS = (
 
 
 def short(text: object, length: int = 80) -> str:
-    """`text` as it may stand in a one-line message: quoted, without control characters, not too long."""
+    """`text` for a one-line message: quoted, without control characters, shortened."""
     quoted = repr(str(text)[: length + 1])
     return quoted if len(quoted) <= length + 2 else quoted[:length] + "...'"
 
 
 def add_framed(digest: Any, *parts: bytes) -> None:
-    """Add parts to a hash with their lengths, which keep the boundary between two from being moved without notice."""
+    """Add parts to a hash with their lengths, so that the hash depends on their boundaries."""
     for part in parts:
         digest.update(len(part).to_bytes(8, "big"))
         digest.update(part)
@@ -37,12 +37,12 @@ class ObjectFiles:
     """The files below one object's folder.
 
     Files may be links, but only to files below the object's folder, below the tree of objects that the user named, or
-    in the cache of a download that this tree is part of (`_caches`): the folder may come from anybody, and no file
-    elsewhere on this machine is any of its business.
+    in the cache of a download that this tree is part of (`_caches`), because the folder is untrusted and must not give
+    access to other files of this machine.
 
     Args:
         folder: of the object, or a link to it.
-        tree: the folder of objects that the user named; the object's own where none is given.
+        tree: the folder of objects that the user named; default: the object's folder.
 
     Example:
         >>> files = ObjectFiles(Path("objects/149"), Path("objects"))
@@ -63,11 +63,11 @@ class ObjectFiles:
         self._roots = (own, top, *(cache for above in within for cache in _caches(above, top)))
 
     def exists(self, name: str) -> bool:
-        """Whether there is something called `name`, if only a link that leads nowhere."""
+        """Whether an entry `name` exists, also if it is a dangling link."""
         return os.path.lexists(self._path(name))
 
     def is_file(self, name: str) -> bool:
-        """Whether `name` is a plain path to a regular file, or a link to one, wherever that may lead."""
+        """Whether `name` is a plain path to a regular file, or a link to any regular file."""
         try:
             return self._path(name).is_file()
         except (OSError, ObjectError):
@@ -77,8 +77,8 @@ class ObjectFiles:
         """The bytes of the file called `name`, a path relative to the folder.
 
         Raises:
-            ObjectError: it is missing, no regular file, out of its place, unreadable, over `most_bytes`, or stands for
-                contents that were not downloaded.
+            ObjectError: it is missing, not a regular file, outside of the folder, unreadable, larger than `most_bytes`,
+                or a pointer to contents that were not downloaded.
         """
         path = self._path(name)
         try:

@@ -25,14 +25,14 @@ MAX_WORD = 64
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What a reader makes of an object's files.
+    """The result of a reader.
 
     Attributes:
-        category: what kind of object it is, such as "Box"; up to 64 printable characters.
+        category: of the object, such as "Box"; up to 64 printable characters.
         bodies: the root, then the movable parts, parents before children.
-        notes: what was left out or read otherwise, for the user to know: one phrase each.
-        content_hash: SHA-256 of all that decides what the object is; None: of the names and contents of the files that
-            were read.
+        notes: messages for the user about files that were left out or interpreted differently, one phrase each.
+        content_hash: SHA-256 of everything that determines the object; None: of the names and contents of the files
+            that were read.
     """
 
     category: str
@@ -43,7 +43,7 @@ class Description:
 
 @runtime_checkable
 class ObjectReader(Protocol):
-    """Reads the objects of one layout. The files may come from anybody: nothing in them can be trusted."""
+    """Reads the objects of one layout, from untrusted files."""
 
     def matches(self, folder: Path) -> bool:
         """Whether the folder looks like an object of this layout; only looks at names."""
@@ -63,7 +63,7 @@ READERS = Registry("object reader", ObjectReader, {"partnet-mobility": "collecto
 
 
 def reader_of(folder: Path) -> str | None:
-    """The name of the first reader whose layout the folder has; None where it holds no object."""
+    """The name of the first reader whose layout the folder has; None if the folder has no object."""
     return next((name for name in READERS.names() if READERS.get(name).matches(folder)), None)
 
 
@@ -72,7 +72,7 @@ def read_object(folder: Path, tree: Path | None = None) -> ArticulatedObject:
 
     Args:
         folder: of the object.
-        tree: the folder of objects that the user named, below which links are followed; `folder` where none is given.
+        tree: the folder of objects that the user named, below which links are followed; default: `folder`.
 
     Raises:
         ObjectError: with one line that says what is wrong with the object's files.

@@ -78,7 +78,7 @@ class Assembly:
         """Add one link.
 
         Args:
-            parent: the link that it hangs on; None for the root.
+            parent: its parent link; None for the root.
             name: of the link.
             meshes: convex pieces; one that has no volume or cannot be cooked carries no collision.
             joint: "fixed", "revolute" or "prismatic"; SAPIEN's joints move about or along the joint frame's x. A root

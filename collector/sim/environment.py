@@ -29,12 +29,12 @@ CLOSED_SHARE = 0.5
 class SapienEnvironment:
     """Implements `collector.sim.simulator.SimEnvironment` with SAPIEN's physics and a depth camera.
 
-    All tries of a rollout are on one part, for what they are to find out is how this door or that switch moves: of the
-    parts that the first observation shows and the task allows, one is drawn in proportion to its visible points.
+    All interactions of a rollout are on one part, because z describes how one door or switch moves. The part is drawn
+    from those that the first observation shows and the task allows, in proportion to its visible points.
 
     Args:
         target: the object.
-        task: which parts count, and from which states.
+        task: gives the target parts and the start states.
         collection: primitive, gripper, fidelity and camera.
         dynamics: the hidden draw.
         world_from_camera: [4, 4].
@@ -107,7 +107,7 @@ class SapienEnvironment:
             return False
 
     def execute(self, action: Action) -> Outcome:
-        """Try the action on the part that its point lies on, in the last observation."""
+        """Execute the action on the part of its point in the last observation."""
         assert self._observed is not None, "observe before you act"
         part = int(self._observed.part_ids[action.point_index])
         self._disturbed = True
@@ -115,11 +115,11 @@ class SapienEnvironment:
             return Trial(self.scene, action, part, self._spec, self._fidelity).run()
 
     def state(self) -> Float:
-        """The joint positions, [parts], which `restore` puts back."""
+        """The joint positions, [parts], for `restore`."""
         return self.scene.joint_positions()
 
     def restore(self, state: Float) -> None:
-        """Put a state back, at rest."""
+        """Restore a state, at rest."""
         self.scene.put(state)
         self._disturbed = False
 
@@ -149,7 +149,7 @@ class SapienEnvironment:
 
 
 def only_sapien(environment: SimEnvironment) -> SapienEnvironment:
-    """The environment, for what looks into SAPIEN's scene.
+    """The environment, for code that needs access to SAPIEN's scene.
 
     Raises:
         UsageError: it is of another simulator.
@@ -160,10 +160,10 @@ def only_sapien(environment: SimEnvironment) -> SapienEnvironment:
 
 
 def camera_for(target: ArticulatedObject, world_from_camera: Float, config: CameraConfig) -> Camera:
-    """The camera that the configuration names.
+    """The camera of the configuration.
 
     Raises:
-        UsageError: it cannot be had on this machine.
+        UsageError: this machine does not support it.
     """
     if config.renderer == "sapien":
         return SapienCamera(target, world_from_camera, config)
@@ -175,7 +175,7 @@ def draw_state(limits: Float, closed: bool, rng: np.random.Generator) -> Float:
 
     Args:
         limits: [parts, 2].
-        closed: whether the task wants every joint closed.
+        closed: whether the task requires every joint to be closed.
         rng: draws the state.
     """
     all_closed = rng.random() < CLOSED_SHARE

@@ -3,7 +3,8 @@
 The hand frame's columns are forward, left, up, where *up* is the approach direction. Every hand ends `TIP_DISTANCE`
 ahead of its frame's origin when closed, so that primitives mean the same for all of them. There are two ways to make a
 hand fly: the free one here, whose palm floats and is driven in all six directions at once, and the published one in
-`collector.sim.jointed_gripper`, whose palm hangs on six joints and which costs the engine twice as much a step.
+`collector.sim.jointed_gripper`, whose palm is attached to six joints and which costs the engine twice as much for each
+step.
 
 Where the hand is, [4], counts from where it was placed: forward, left, up (m) and its turn about up (rad).
 """
@@ -33,11 +34,11 @@ ALONG = {
 
 
 class Gripper(Protocol):
-    """A hand in a scene, however it flies.
+    """A hand in a scene.
 
     Attributes:
-        palm: the link whose contact ends a trial where the first-contact rule holds.
-        fingers: the other links that touch, whose contact is what a primitive wants.
+        palm: the link whose contact ends a trial under the first-contact rule.
+        fingers: the other links, whose contact is intended.
     """
 
     palm: Link
@@ -46,13 +47,13 @@ class Gripper(Protocol):
     def set_pace(self, pace: float) -> None:
         """Prepare for moving `pace` times faster than published.
 
-        The dampers of the drives become weaker by as much, so that they exert the published forces: what is slow enough
-        to be governed by forces alone then comes out the same.
+        The damping of the drives is divided by `pace`, so that they exert the published forces; slow motions, which
+        only depend on forces, stay the same.
         """
         ...
 
     def place(self, rotation: Float, position: Float, *, opened: bool) -> None:
-        """Put the hand somewhere at rest, holding nothing, with the drives keeping it there.
+        """Place the hand at rest, without a grasp; the drives keep it there.
 
         Args:
             rotation: [3, 3], world_from_hand.
@@ -62,11 +63,11 @@ class Gripper(Protocol):
         ...
 
     def shift(self, place: Float, velocity: Float) -> None:
-        """Put the hand at `place`, [4], moving at `velocity`, [4]."""
+        """Move the hand to `place`, [4], at once, with `velocity`, [4]."""
         ...
 
     def displacement(self) -> Float:
-        """Where the hand is, [3], from where it was placed, hand frame, without its turn."""
+        """Translation of the hand since it was placed, [3], hand frame."""
         ...
 
     def drive(self, place: Float) -> None:
@@ -74,19 +75,19 @@ class Gripper(Protocol):
         ...
 
     def drive_velocity(self, velocity: Float) -> None:
-        """Let the drives aim at `velocity`, [4], as well."""
+        """Set the velocity target of the drives, [4]."""
         ...
 
     def close(self) -> None:
-        """Close the fingers, or do what else makes this hand hold on to what it touches."""
+        """Close the fingers, or otherwise make this hand hold what it touches."""
         ...
 
     def opening(self) -> float:
-        """How far all fingers together are open, m; what rows keep as `grasp_opening`."""
+        """How far all fingers together are open, m; stored in rows as `grasp_opening`."""
         ...
 
     def holds(self) -> bool:
-        """Whether the hand, told to close, may be holding something."""
+        """Whether the closed hand may hold something."""
         ...
 
     def coordinates(self) -> Float:
@@ -107,7 +108,7 @@ class GripperSpec:
 
 
 def still() -> Float:
-    """A place or a velocity, [4], of zeros."""
+    """A position or a velocity, [4], of zeros."""
     return np.zeros(4)
 
 
@@ -144,7 +145,7 @@ class TwoFingers:
     finger_mass: float
 
     def add_fingers(self, assembly: Assembly, hand: Link) -> tuple[Link, Link]:
-        """Hang the fingers on the palm's link; their drives have no strength until `set_finger_pace`."""
+        """Add the fingers to the palm's link; their drives have no strength until `set_finger_pace`."""
         left, right = (self._add_finger(assembly, hand, *named) for named in (("left", 1.0), ("right", -1.0)))
         return left, right
 
@@ -165,7 +166,7 @@ class TwoFingers:
 
 
 class FreeGripper:
-    """A hand whose palm floats freely, drawn to its target by one drive with six degrees of freedom.
+    """A hand whose palm is a free body, moved to its target by one drive with six degrees of freedom.
 
     Args:
         shape: of the hand.

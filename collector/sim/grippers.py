@@ -1,4 +1,4 @@
-"""The hands that there are, by name."""
+"""The registry of hands."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from shared.extensions import Registry
 
 
 def two_fingered(shape: TwoFingers) -> GripperSpec:
-    """A hand of a shape, which flies either way."""
+    """A hand with two fingers, jointed or free."""
 
     def build(scene: sapien.Scene, material: physx.PhysxMaterial, jointed: bool) -> Gripper:
         return build_jointed(shape, scene, material) if jointed else build_free(shape, scene, material)

@@ -1,4 +1,4 @@
-"""The flying hand as published: its palm hangs on three sliding and three turning joints, each with a drive.
+"""The flying hand as published: its palm is attached to three sliding and three turning joints, each with a drive.
 
 The reference fidelity uses it, and so does the published protocol against which collection is timed.
 """
@@ -26,7 +26,7 @@ DRIVEN = (0, 1, 2, 5)
 
 
 class JointedGripper:
-    """A hand whose place is a joint position.
+    """A hand whose pose is a joint position.
 
     Args:
         shape: of the hand.
@@ -104,7 +104,7 @@ class JointedGripper:
 
 
 def on_arm(place: Float) -> Float:
-    """A place or a velocity, [4], as the six joints of the carrier have it."""
+    """A position or a velocity, [4], for the six joints of the carrier."""
     arm = np.zeros(6)
     arm[list(DRIVEN)] = place
     return arm

@@ -60,7 +60,7 @@ def _load(content: bytes) -> None:
 
 
 def empty_library(name: str) -> bytes:
-    """A shared library (ELF, x86-64) of that name which holds nothing.
+    """A shared library (ELF, x86-64) of that name without symbols.
 
     It has three program headers, which map the file, name its dynamic section and say that no stack is executed. It has
     the tables that the linker insists on: strings, symbols (the empty one alone) and their hashes.

@@ -21,7 +21,7 @@ HOW_TO_GET_ONE = (
 
 @cache
 def why_unavailable() -> str:
-    """Why SAPIEN cannot render on this machine, in one line; "" where it can."""
+    """Why SAPIEN cannot render on this machine, in one line; "" if it can."""
     if not libx11.is_installed():
         return "no library libX11.so.6, which SAPIEN's renderer calls; on Debian, libx11-6"
     try:

@@ -35,13 +35,13 @@ PARKED = np.array([0.0, 0.0, 50.0])
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """What the hand touches at this moment, by forces that the published rule counts.
+    """The present contacts of the hand, by the published force threshold.
 
     Attributes:
         finger_on: bodies (0 the root, k the k-th part) that a finger presses on.
         palm: whether the palm presses on anything.
-        brushes: whether the hand touches anything at all, however lightly.
-        clearance: how far the hand is from the object at least, as far as the engine looks.
+        brushes: whether the hand touches anything, with any force.
+        clearance: a lower bound of the distance between hand and object, within the engine's range.
     """
 
     finger_on: frozenset[int]
@@ -62,7 +62,7 @@ class Scene:
         target: the object.
         dynamics: the hidden draw, applied to every movable part by the records of its parameters.
         fidelity: time step, solver iterations, and how the hand flies.
-        primitive: what will be executed.
+        primitive: the primitive that will be executed.
         gripper: the name of the hand.
 
     Attributes:
@@ -109,27 +109,27 @@ class Scene:
         return self._joints
 
     def set_part_mass(self, mass: float) -> None:
-        """Give every movable part this mass, kg; its inertia is scaled along."""
+        """Set the mass of every movable part, kg, and scale its inertia."""
         for link in self.links:
             set_mass(link, mass)
 
     def set_joint_friction(self, limit: float) -> None:
-        """Give every movable joint this Coulomb friction: N m if it turns, N if it slides."""
+        """Set the Coulomb friction of every movable joint: N m if it turns, N if it slides."""
         for joint in self.joints:
             joint.set_drive_property(0.0, FRICTION_DAMPING, force_limit=limit)
 
     def set_surface_friction(self, coefficient: float) -> None:
-        """Give the surfaces of hand and object this friction coefficient, static and dynamic."""
+        """Set the static and dynamic friction coefficient of the surfaces of hand and object."""
         self._material.static_friction = self._material.dynamic_friction = coefficient
 
     def set_timing(self, timing: Timing) -> None:
-        """Step time, and move the hand, as `timing` says from now on."""
+        """Use `timing` for the time step and for the hand from now on."""
         self.system.set_timestep(1.0 / timing.steps_per_second)
         self._impulse_squared = (CONTACT_FORCE / timing.steps_per_second) ** 2
         self.gripper.set_pace(timing.pace)
 
     def park(self) -> None:
-        """Take the hand out of reach, and step time as before any trial."""
+        """Move the hand away, and reset the time step."""
         self.set_timing(self._fidelity.approach)
         self.gripper.place(np.eye(3), PARKED, opened=False)
 
@@ -142,10 +142,10 @@ class Scene:
         return np.concatenate([self._articulation.get_qpos(), self.gripper.coordinates()])
 
     def put(self, positions: Float) -> None:
-        """Put the object at rest with its joints at `positions`, [parts], and the hand out of reach.
+        """Set the joints to `positions`, [parts], at rest, and move the hand away.
 
-        One step is taken in between, so that the engine forgets the contacts of the trial before: a trial then comes
-        out the same after any other, and alone.
+        One step in between removes the contacts of the previous trial from the engine, so that a trial does not depend
+        on the trials before it.
         """
         self.park()
         for _ in range(FORGETTING_STEPS):
@@ -161,7 +161,7 @@ class Scene:
         self._articulation.set_qvel(np.zeros_like(packed))
 
     def restrict(self, positions: Float) -> None:
-        """Apply the hidden direction mode: which ways joints turn from `positions`, [parts].
+        """Apply the hidden direction mode, relative to `positions`, [parts].
 
         The range of travel is that of the joint's own limits; as built, nothing changes.
         """
@@ -174,7 +174,7 @@ class Scene:
         return np.asarray(self._links[body].entity_pose.to_transformation_matrix(), dtype=np.float64)
 
     def settle(self, still_steps: int, most_steps: int) -> bool:
-        """Let the object come to rest with the hand parked.
+        """Simulate until the object rests, with the hand away.
 
         Returns:
             Whether it did: every joint moved less than 1e-6 a step and nothing pressed on anything for `still_steps`
@@ -193,7 +193,7 @@ class Scene:
         return False
 
     def contact(self) -> Contact:
-        """What the hand touches after the last step."""
+        """The contacts of the hand after the last step."""
         finger_on, palm, brushes, clearance = set(), False, False, CONTACT_RANGE
         for contact in self.system.get_contacts():
             first, second = contact.bodies
@@ -224,7 +224,7 @@ class Scene:
 
 
 def restricted_limits(limits: Float, positions: Float, direction: Direction) -> Float:
-    """Joint limits [parts, 2] under a direction mode, from where the joints stand ([parts]).
+    """Joint limits [parts, 2] under a direction mode, from the joint positions, [parts].
 
     Seen along the joint's axis, clockwise is towards greater positions.
     """

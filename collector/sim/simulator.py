@@ -1,4 +1,4 @@
-"""What a rollout needs of a simulator, whichever physics it computes, and the simulators that there are, by name."""
+"""The interface between a rollout and a simulator, and the registry of simulators."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -15,11 +15,11 @@ from shared.types import Environment, Float, HiddenDynamics
 
 @dataclass(frozen=True, slots=True)
 class PrivilegedState:
-    """What a simulator knows of the present state and no camera sees.
+    """Data of the present state that no camera sees.
 
     Attributes:
         joint_positions: [parts], rad or m, in part order.
-        joint_limits: [parts, 2], lower and upper, the hidden direction mode applied.
+        joint_limits: [parts, 2], lower and upper, with the hidden direction mode.
         joint_twist: [6], (w, v) of the joint of one part, world (see `collector.objects.articulation.joint_twist`).
     """
 
@@ -34,8 +34,8 @@ class SimEnvironment(Environment, Protocol):
     The same arguments and the same calls give the same bits, in any process.
 
     Attributes:
-        object: what is acted upon.
-        primitive: name of what `execute` executes.
+        object: the object.
+        primitive: name of the primitive that `execute` executes.
     """
 
     object: ArticulatedObject
@@ -44,7 +44,7 @@ class SimEnvironment(Environment, Protocol):
     def reset(self, rng: np.random.Generator) -> bool:
         """Draw a new start state and let it settle; whether it came to rest.
 
-        The first state fixes what the hidden direction mode allows, for good.
+        The first state fixes the limits of the hidden direction mode for the whole rollout.
         """
         ...
 
@@ -53,15 +53,15 @@ class SimEnvironment(Environment, Protocol):
         ...
 
     def state(self) -> Float:
-        """The present state, in a form of the simulator's own, which `restore` puts back."""
+        """The present state, in the simulator's own format, for `restore`."""
         ...
 
     def restore(self, state: Float) -> None:
-        """Put a state back, at rest."""
+        """Restore a state, at rest."""
         ...
 
     def privileged(self, part: int) -> PrivilegedState:
-        """What the camera does not see; `part` (1-based) is the one whose twist is wanted."""
+        """Data that no camera sees, with the joint twist of `part` (1-based)."""
         ...
 
 

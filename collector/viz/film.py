@@ -33,7 +33,7 @@ DYNAMICS = HiddenDynamics(part_mass=0.2, joint_friction=0.3, surface_friction=2.
 SEEN_FROM = (190.0, 40.0)
 """Azimuth and elevation, deg, of the camera whose cloud the actions are drawn from."""
 STATES, TRIES = 12, 20
-"""States drawn for a primitive at the most, and random actions tried from each of them."""
+"""States drawn for a primitive at the most, and random actions executed from each of them."""
 ENOUGH = 4
 """Successes, of which the one that takes the touched point the farthest is shown."""
 EDGE_SHARE = 0.5
@@ -46,7 +46,7 @@ PALM_COLOUR, FINGER_COLOUR = (0.2, 0.2, 0.25), (1.0, 0.8, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where everything is at one moment of a trial.
+    """The poses of object and hand at one moment of a trial.
 
     Attributes:
         joint_positions: [parts], of the object.
@@ -59,7 +59,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Take:
-    """One filmed trial; `contact` is None where the hand touched nothing, `hand` are the shapes of its links."""
+    """One filmed trial; `contact` is None if the hand touched nothing; `hand` has the shapes of its links."""
 
     action: Action
     primitive: str
@@ -78,13 +78,13 @@ class Take:
 
     @property
     def caption(self) -> str:
-        """What came of it, in a few words."""
+        """The outcome in a few words."""
         success = "success" if self.outcome.success else "failure"
         return f"{self.primitive}: {self.outcome.kind.value}, {success}, m = {self.outcome.motion:.3f}"
 
 
 class FilmedTrial(Trial):
-    """A trial that remembers where everything was at its moments."""
+    """A trial that records the poses at its moments."""
 
     def __init__(self, scene: Scene, action: Action, target: int, primitive: str) -> None:
         super().__init__(scene, action, target, PRIMITIVES.get(primitive), FIDELITY)
@@ -113,11 +113,11 @@ class FilmedTrial(Trial):
 def film(
     target: ArticulatedObject, primitives: Sequence[str], seed: int, out_png: Path, gripper: str = PANDA
 ) -> list[str]:
-    """Write a picture of one trial of each primitive, a random one that succeeds wherever one is found.
+    """Write a picture of one random trial of each primitive, preferably one that succeeds.
 
     Args:
         target: the object.
-        primitives: what to show, in this order.
+        primitives: their names, in the order of the picture.
         seed: of the random trials.
         out_png: file to write.
         gripper: the name of the hand.
@@ -126,7 +126,7 @@ def film(
         The caption of each trial.
 
     Raises:
-        UsageError: something is not found by its name, no camera sees a part that moves, or the file cannot be
+        UsageError: a name is unknown, no camera sees a movable part, or the file cannot be
             written.
     """
     GRIPPERS.get(gripper)

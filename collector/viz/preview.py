@@ -1,4 +1,4 @@
-"""Contact sheets: many objects in one picture, each movable part in a colour of its own."""
+"""Contact sheets: many objects in one picture, each movable part in another colour."""
 
 from collections.abc import Sequence
 from io import BytesIO
@@ -36,9 +36,9 @@ def contact_sheet(
     """Write a grid of pictures, id and category below each: the body grey, every movable part coloured.
 
     Args:
-        objects: what to show, in reading order.
+        objects: in reading order.
         out_png: file to write.
-        openness: where every joint stands between its lower limit (0) and its upper limit (1).
+        openness: position of every joint between its lower limit (0) and its upper limit (1).
         azimuth_deg: of the camera; objects face 180.
         image_size: pixels along an edge of one picture.
         titles: what is below each picture instead.
@@ -64,10 +64,10 @@ def contact_sheet(
 
 
 def save(figure: Figure, out_png: Path) -> None:
-    """Write a figure as a PNG file, making its folder if need be.
+    """Write a figure as a PNG file; a missing folder is created.
 
     Raises:
-        UsageError: it cannot be written.
+        UsageError: the file cannot be written.
     """
     image = BytesIO()
     figure.savefig(image, format="png")

@@ -1,4 +1,4 @@
-"""Stage 2: Adaptive Affordance PrefixPrediction, as in the paper or from an oracle that was told the hidden facts.
+"""Stage 2: Adaptive Affordance Prediction, as in the paper or taught by an oracle that is given the hidden facts.
 
 Shapes: I interactions, B rollouts, n rows of each, K the longest context.
 """

@@ -117,7 +117,7 @@ class AipStage:
 
     @torch.no_grad()
     def gains(self, ordered: OrderedRows) -> Gains:
-        """How much each try lowers the AAP loss on the rows that are no context."""
+        """How much each interaction lowers the AAP loss on the rows outside of the context."""
         frozen, rows = self.frozen, self.dataset.rows
         context = ordered.longest_context(self.config.context)
         tries = ordered.rows[:, :context]

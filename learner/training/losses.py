@@ -78,12 +78,12 @@ def correction_loss(corrected: Tensor, successes: Tensor, mask: Tensor) -> Tenso
 
 
 def information_gains(losses: Tensor) -> Tensor:
-    """Targets of the AIP critic: how much each try lowered the AAP action scoring loss.
+    """Targets of the AIP critic: how much each interaction lowered the AAP action scoring loss.
 
     gt_u_i = L_{I_(i-1)} - L_{I_i} (AdaAfford, AIP Action Scoring Loss).
 
     Args:
-        losses: after no tries, one, ..., K, [..., K + 1].
+        losses: after 0, 1, ..., K interactions, [..., K + 1].
 
     Returns:
         [..., K].

@@ -36,7 +36,8 @@ def parse_object(data: bytes, source: str, values: int = MAX_VALUES, *, unique: 
         raise StoreError(f"{source}: holds more than {values} values; the file is damaged or foreign")
     data = data.removeprefix(codecs.BOM_UTF8)
     try:
-        # Unlike the parser of the standard library this one has a limit of depth that hangs on no caller's stack.
+        # Unlike the standard library's parser, this one has a limit of depth that does not depend on the caller's
+        # stack.
         content = from_json(data, allow_inf_nan=False)
         if unique:
             json.loads(data, object_pairs_hook=_refuse_twins)
@@ -91,4 +92,4 @@ def named_twice(pairs: list[tuple[str, Any]]) -> str | None:
 
 def _refuse_twins(pairs: list[tuple[str, Any]]) -> None:
     if (name := named_twice(pairs)) is not None:
-        raise ValueError(f"'{plain(name, MAX_WORD)}' stands twice")
+        raise ValueError(f"'{plain(name, MAX_WORD)}' occurs twice")

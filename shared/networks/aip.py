@@ -11,7 +11,7 @@ SCORE_SCALE = 0.02
 
 
 class Aip(nn.Module):
-    """Adaptive Interaction Proposal (AdaAfford, the section of that name): how much would a try tell?
+    """Adaptive Interaction Proposal (AdaAfford, the section of that name): predicts how much an interaction reveals.
 
     Holds the AIP critic C and the AIP affordance network D over a PointNet++ of their own. D sees its features without
     passing a gradient back, as in `shared.networks.aap.Aap`.

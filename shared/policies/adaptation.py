@@ -1,7 +1,7 @@
-"""Test time: what a history of tries says about an object (`shared.policies.proposers` says what to try next).
+"""Adaptation at test time: predictions of a policy, given a history of interactions with one object.
 
-Everything here runs on the CPU in a few milliseconds a step, needs nothing but a policy, and depends on its random
-generator alone.
+Everything here runs on the CPU in a few milliseconds a step, needs only a policy, and is deterministic for a given
+random generator. `shared.policies.proposers` chooses interactions.
 
 Shapes: N points of a cloud, A actions, S proposals at a point.
 """
@@ -33,7 +33,7 @@ MAX_CACHED_OBSERVATIONS = 64
 
 @dataclass(slots=True)
 class _Entry:
-    """What is kept of one observation; holding it keeps its identity from being reused."""
+    """Cached results of one observation; the reference to it prevents that its id is reused."""
 
     observation: Observation
     clouds: CloudBatch
@@ -59,12 +59,12 @@ class Proposals:
 class Adapter:
     """A policy at test time.
 
-    Clouds are encoded when first needed and remembered by the identity of their observation, so that a history costs
-    one small network a step.
+    Clouds are encoded when first needed and cached by the identity of their observation, so a history costs one small
+    network a step.
 
     Example:
         >>> adapter = Adapter(Policy.from_files(files))
-        >>> before = adapter.affordance(observation, [])         # [N], AAP with no tries
+        >>> before = adapter.affordance(observation, [])         # [N], AAP without interactions
         >>> after = adapter.affordance(observation, history)     # [N], adapted
     """
 
@@ -83,7 +83,7 @@ class Adapter:
 
     @torch.inference_mode()
     def z(self, history: Sequence[Interaction], module: ModuleName = "aap") -> Tensor:
-        """The hidden information in a history, [latent_width]; order does not matter, and none is allowed."""
+        """The hidden information z of a history in any order, [latent_width]; the history may be empty."""
         latent = self.policy.config.latent_width
         codes, weights = torch.zeros(0, latent), torch.zeros(0)
         if history:
@@ -99,14 +99,14 @@ class Adapter:
         module: ModuleName = "aap",
         points: NDArray[np.int64] | None = None,
     ) -> Float32:
-        """A_I: the AAP actionability after a history, in [0, 1], of every point, [N], or of those at `points` alone."""
+        """A_I: the AAP actionability after a history, in [0, 1], of every point, [N], or of `points` only."""
         asked = np.arange(len(observation.points)) if points is None else points
         features, places = self.features(observation, module, asked), self.places(observation, asked)
         return self._adaptive(module).actionability(features, places, self.z(history, module)).numpy()
 
     @torch.inference_mode()
     def prior_affordance(self, observation: Observation, points: NDArray[np.int64] | None = None) -> Float32:
-        """A: Where2Act's actionability, in [0, 1], of every point, [N], or of those at `points` alone."""
+        """A: Where2Act's actionability, in [0, 1], of every point, [N], or of `points` only."""
         asked = np.arange(len(observation.points)) if points is None else points
         features, places = self.features(observation, "prior", asked), self.places(observation, asked)
         return self.policy.prior.actionability(features, places).numpy()
@@ -136,7 +136,7 @@ class Adapter:
 
     @torch.inference_mode()
     def features(self, observation: Observation, module: ModuleName, points: NDArray[np.int64]) -> Tensor:
-        """All that a module knows of points, [len(points), point_width]."""
+        """A module's features of points and of their surroundings, [len(points), point_width]."""
         index, entry = torch.from_numpy(points), self._entry(observation)
         features = self._encoder(module).features_at(self.encode(observation, module), torch.zeros_like(index), index)
         around = torch.from_numpy(entry.around[points].astype(np.int64))
@@ -144,7 +144,7 @@ class Adapter:
         return torch.cat([features, offsets.flatten(1)], dim=-1)
 
     def places(self, observation: Observation, points: NDArray[np.int64]) -> Tensor:
-        """Places as actions are told them: p less the middle of what may be moved, [len(points), 3]."""
+        """Positions relative to the centre of the movable points, [len(points), 3]."""
         entry = self._entry(observation)
         return entry.clouds.points[0, torch.from_numpy(points)] - entry.middle
 

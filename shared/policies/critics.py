@@ -1,6 +1,6 @@
-"""Critics at test time: what a history of tries makes a method believe of actions and points.
+"""Critics at test time: scores of actions and points, given a history of interactions.
 
-Shapes: N points of a cloud, A actions, S proposals at a point, K tries, Q points asked about.
+Shapes: N points of a cloud, A actions, S proposals at a point, K interactions, Q queried points.
 """
 
 from collections.abc import Sequence
@@ -17,24 +17,24 @@ from shared.types import Action, Float32, Interaction, Observation
 
 
 class Critic(Protocol):
-    """What every method's beliefs look like to a proposer."""
+    """Scores actions and points, given a history."""
 
     name: CriticName
 
     def affordance(
         self, observation: Observation, points: NDArray[np.int64], history: Sequence[Interaction]
     ) -> Float32:
-        """The actionability of the points at some indices after a history, [Q], in [0, 1]."""
+        """Actionability of the points with these indices, given a history, [Q], in [0, 1]."""
         ...
 
     def predict(self, observation: Observation, actions: Sequence[Action], history: Sequence[Interaction]) -> Float32:
-        """The scores of actions after a history, [A], in [0, 1]."""
+        """Scores of actions, given a history, [A], in [0, 1]."""
         ...
 
     def predict_proposals(
         self, observation: Observation, proposals: Proposals, history: Sequence[Interaction]
     ) -> Tensor:
-        """The scores of proposals at one point after a history, [S], in [0, 1]."""
+        """Scores of proposals at one point, given a history, [S], in [0, 1]."""
         ...
 
 
@@ -44,7 +44,7 @@ def critic_names() -> list[CriticName]:
 
 
 def critic_named(name: CriticName, adapter: Adapter) -> Critic:
-    """The critic of a policy that is called `name`.
+    """The critic called `name`, with the networks of a policy.
 
     Raises:
         UsageError: there is none, or the policy's networks that it needs are not trained.
@@ -74,7 +74,7 @@ def best_action(
 
 
 class Where2ActCritic:
-    """The prior, which knows nothing of tries."""
+    """The prior, which ignores the history."""
 
     name: CriticName = "where2act"
 

@@ -1,9 +1,9 @@
-"""Tries at points spread by furthest-point sampling (FPS): the baselines that AIP is compared with.
+"""Interactions at points spread by furthest-point sampling (FPS): the baselines that AIP is compared with.
 
-The next point is the one farthest from those that were tried. The paper speaks of points only; the rotation there is
-the best of 100 by the method's own critic, as in an exploit.
+The next point is the one farthest from the earlier interaction points. The paper specifies only the points; the
+rotation is the best of 100 by the method's own critic, as in an exploit.
 
-Shapes: C points that may be tried, K tries.
+Shapes: C candidate points, K interactions.
 """
 
 from abc import ABC, abstractmethod
@@ -18,25 +18,25 @@ from shared.policies.methods import CriticName, ProposerKind
 from shared.types import Action, Float, Float32, Interaction, Observation
 
 THRESHOLD = 0.5
-"""Actionability of points that are worth a try (AdaAfford, supplement, Details of Baselines)."""
+"""Actionability of points that are worth an interaction (AdaAfford, supplement, Details of Baselines)."""
 LEAST_POINTS = 50
-"""Where fewer points reach it, the threshold is set lower until this many do (the same place)."""
+"""If fewer points reach the threshold, it is lowered until this many do (the same section)."""
 
 
 class FpsProposer(ABC):
-    """One try after the other by FPS; never stops.
+    """Proposes interactions by FPS; never stops.
 
-    Points are those that the task may act on, in the cloud as it is seen now, and the tries count where they touched.
-    With nothing tried yet every point is as far as any other.
+    Candidates are the movable points of the present cloud. Distances are to the points of the earlier interactions;
+    without one, all points are equally far.
 
     Args:
         adapter: the policy.
-        rng: draws the first point, where FPS may begin anywhere, and the rotations.
+        rng: draws the first point, if FPS may begin anywhere, and the rotations.
     """
 
     name: str
     critic_name: CriticName = "aap"
-    """Whose actionability is looked at, after the tries so far, and who chooses the rotation."""
+    """The critic that gives the actionability and chooses the rotation."""
 
     def __init__(self, adapter: Adapter, rng: np.random.Generator) -> None:
         self.adapter = adapter
@@ -44,7 +44,7 @@ class FpsProposer(ABC):
         self.critic = critic_named(self.critic_name, adapter)
 
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
-        """The next try; never None."""
+        """The next interaction; never None."""
         candidates = movable_points(observation)
         actionability = self.critic.affordance(observation, candidates, history)
         tried = np.array([interaction.action.point for interaction in history]).reshape(-1, 3)
@@ -54,10 +54,10 @@ class FpsProposer(ABC):
 
     @abstractmethod
     def choose(self, spread: Float | None, actionability: Float32) -> int:
-        """Which point to try.
+        """Choose a point.
 
         Args:
-            spread: distance of each point to the nearest that was tried, [C]; None where nothing was.
+            spread: distance of each point to the nearest interaction point, [C]; None without interactions.
             actionability: of each point, [C].
         """
 
@@ -94,7 +94,7 @@ class Where2ActFpsProposer(ActionableFpsProposer):
 class WeightedFpsProposer(FpsProposer):
     """FPS by "the weighted distance" (AdaAfford, supplement, Ours-argfps): distance times actionability.
 
-    The paper says that the two are combined, but not how; a product needs no constant. The first try goes to the most
+    The paper does not say how the two are combined; a product needs no constant. The first interaction is at the most
     actionable point.
     """
 
@@ -112,7 +112,7 @@ WHERE2ACT_FPS = ProposerKind(lambda adapter, rng, budget: Where2ActFpsProposer(a
 
 
 def distances_to(points: Float, tried: Float) -> Float | None:
-    """Distance of each point, [C, 3], to the nearest of those tried, [K, 3]; None where K is 0."""
+    """Distance of each point, [C, 3], to the nearest interaction point, [K, 3]; None if K is 0."""
     if not len(tried):
         return None
     distances: Float = np.linalg.norm(points[:, None] - tried[None], axis=-1).min(axis=1)

@@ -42,11 +42,11 @@ class ProposerKind:
     """A kind of proposer.
 
     Attributes:
-        make: makes one of an `Adapter`, a random generator and the most tries that it may propose; where it needs no
-            networks, there may be None in place of the adapter.
-        modules: the networks that it needs; none: it proposes without a policy.
-        draw: likewise makes one that draws its points from a share of the cloud, the last argument, where that of
-            `make` takes the best; None: its points are not chosen so.
+        make: makes one from an `Adapter`, a random generator and the most interactions that it may propose; the adapter
+            may be None if no networks are needed.
+        modules: the networks that it needs; empty: it needs no policy.
+        draw: makes, in the same way, one that draws its points from a share of the cloud, the last argument, where that
+            of `make` takes the best; None: its points are not chosen so.
     """
 
     make: Callable[[Any, np.random.Generator, int], Proposer]
@@ -56,14 +56,14 @@ class ProposerKind:
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """A network that is compared with AAP, and is trained only where a method wants it.
+    """A network that is compared with AAP; it is trained only if a method uses it.
 
     Attributes:
-        network: makes the network, whatever its weights.
-        critic: what a history of tries makes it believe; of an adapter whose policy holds the trained network.
+        network: makes the untrained network.
+        critic: makes its critic from an adapter whose policy has the trained network.
         training: "module:attribute" of its `learner.stages.trainers.BaselineTraining`. Only the learner imports that,
-            since a robot that carries the network does not train it.
-        begin: makes the network as it is before training, from a trained prior; None: as `network` does.
+            because a robot that uses the network does not train it.
+        begin: makes the network before its training from a trained prior; None: `network` is used.
         needs: networks that are trained before it; the last of them is the stage to start from.
     """
 
@@ -100,9 +100,9 @@ class Method:
     """One method.
 
     Attributes:
-        tries: who fills the set of interactions; None: nobody.
-        critic: whose scores and actionability are judged, and choose the action in the end.
-        in_one_shot: the number of tries that it takes whatever the budget, where it takes no other.
+        tries: the proposer of the interactions; None: there are no interactions.
+        critic: the critic that is evaluated and chooses the final action.
+        in_one_shot: the fixed number of interactions, independent of the budget; None: the budget.
         version: the policy version that it uses; None: the one that is evaluated.
     """
 
@@ -112,7 +112,7 @@ class Method:
     version: int | None = None
 
     def budgets(self, wanted: Sequence[int]) -> list[int]:
-        """The numbers of tries after which it is judged, in ascending order."""
+        """The numbers of interactions after which it is evaluated, ascending."""
         return sorted(set(wanted)) if self.in_one_shot is None else [self.in_one_shot]
 
     @property

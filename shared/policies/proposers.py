@@ -1,4 +1,4 @@
-"""Proposers that use a policy: what to try next, and what to do in the end.
+"""Proposers that use a policy: for the next interaction, and for the final action.
 
 Everything here runs on the CPU in a few milliseconds a step and depends on its random generator alone.
 """
@@ -22,16 +22,16 @@ stop at once; 0 stops where no point promises any gain."""
 
 
 class AipProposer:
-    """What to try next, by the AIP module (AdaAfford, Next-step Interaction Action Proposal).
+    """Proposes the next interaction by the AIP module (AdaAfford, Next-step Interaction Action Proposal).
 
-    The point with the highest AIP actionability among the movable ones, and there the best by the AIP critic of 100
-    rotations from the prior's proposal network. Stops when the budget is reached, or when the highest actionability is
+    It chooses the movable point with the highest AIP actionability, and there the best of 100 rotations of the prior's
+    proposal network by the AIP critic. It stops when the budget is reached, or when the highest actionability is
     below the threshold (AdaAfford, Stopping Criterion).
 
     With a `share`, the point is drawn from that share of the cloud's points, those with the highest AIP actionability:
     the published code draws from the best 100 of 10,000 (AdaAffordCode, code/sample_succ.py, `while len(xs) < 100`).
 
-    Deviation: `at_least` tries are made whatever the threshold says, since no history at all tells nothing.
+    Deviation: `at_least` interactions are proposed in spite of the threshold, because an empty history reveals nothing.
     """
 
     name = "aip"
@@ -79,10 +79,10 @@ AIP = ProposerKind(
 
 
 class ExploitProposer:
-    """The action that a critic believes in most (AdaAfford, Evaluation Metrics, sample-success).
+    """Proposes the action with the best score of a critic (AdaAfford, Evaluation Metrics, sample-success).
 
-    A random one of the 100 movable points with the highest actionability, and there the best by the critic of 100
-    rotations from the prior's proposal network.
+    It draws one of the 100 movable points with the highest actionability, and chooses there the best of 100 rotations
+    of the prior's proposal network by the critic.
 
     Published clouds have 10,000 points and ours fewer, so that 100 are a larger part of them: with a `share`, the point
     is one of that share of the cloud's points, 0.01 as published (AdaAffordCode, code/sample_succ.py).
@@ -107,7 +107,7 @@ class ExploitProposer:
 
 
 def points_of(share: float, observation: Observation) -> int:
-    """How many points a share of a cloud is, at least one; of all points, since the published 100 are of 10,000."""
+    """How many points a share of a cloud is, at least one; of all points, because the published 100 are of 10,000."""
     return max(1, round(share * len(observation.points)))
 
 
@@ -121,17 +121,17 @@ def drawn_point(candidates: NDArray[np.int64], scores: Float32, count: int, rng:
 def proposer_named(
     name: str, adapter: Adapter | None, rng: np.random.Generator, budget: int, share: float | None = None
 ) -> Proposer:
-    """The proposer that rows call `name`.
+    """The proposer called `name`.
 
     Args:
-        name: one of `shared.policies.methods.PROPOSERS`, or a critic's, to exploit what it believes.
-        adapter: the policy; None where the proposer needs none.
-        rng: draws what it draws.
-        budget: how many tries it may propose.
+        name: one of `shared.policies.methods.PROPOSERS`, or the name of a critic, for a proposer that exploits it.
+        adapter: the policy; None if the proposer needs none.
+        rng: of its random draws.
+        budget: how many interactions it may propose.
         share: of a cloud's points, from which its points are drawn, as far as it draws any; None: its own way.
 
     Raises:
-        UsageError: there is none of that name, or the networks that it needs are not trained.
+        UsageError: no proposer has this name, or the networks that it needs are not trained.
     """
     if name in PROPOSERS.names():
         kind = PROPOSERS.get(name)

@@ -1,7 +1,7 @@
-"""Where2Act-adaptation: Where2Act whose scores are corrected at points similar to those that were tried.
+"""Where2Act-adaptation: Where2Act whose scores are corrected at points similar to the interaction points.
 
 `learner.stages.where2act_adaptation` trains it. Shapes: N points of a cloud, A actions, S proposals at a point,
-Q points asked about, K tries.
+Q queried points, K interactions.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ class Where2ActAdaptation(nn.Module):
         self.similarity_head = Head((width, width, width), 1, config)
 
     def similarities(self, tried: Tensor, asked: Tensor, distances: Tensor) -> Tensor:
-        """sim_pq of tried points p and points q that are asked about, [...].
+        """sim_pq of interaction points p and queried points q, [...].
 
         Args:
             tried: of Where2Act, at p, [..., point_width].
@@ -54,20 +54,20 @@ class Where2ActAdaptation(nn.Module):
 
 
 def influences(similarities: Tensor, successes: Tensor, scores: Tensor) -> Tensor:
-    """What each try adds to the scores of points: (r - s_u) sim_pq (AdaAfford, supplement), [..., Q, K].
+    """Score corrections of points by each interaction, (r - s_u) sim_pq (AdaAfford, supplement), [..., Q, K].
 
     The paper gives the influence of one interaction; those of several are added up.
 
     Args:
         similarities: [..., Q, K].
         successes: r as 0 or 1, [..., K].
-        scores: s_u, what Where2Act said of the tries, [..., K].
+        scores: s_u, what Where2Act said of the interactions, [..., K].
     """
     return (successes - scores)[..., None, :] * similarities
 
 
 class AdaptationCritic:
-    """Where2Act-adaptation: Where2Act, corrected at points similar to those tried (AdaAfford, Details of Baselines).
+    """Where2Act-adaptation: Where2Act with corrected scores (AdaAfford, Details of Baselines).
 
     s_u*|new = s_u* + sum (r - s_u) sim_pq, and a_q likewise. Deviation: cut to [0, 1], which the paper does not say.
     """
@@ -101,7 +101,7 @@ class AdaptationCritic:
     def _corrected(
         self, before: Tensor, observation: Observation, points: NDArray[np.int64], history: Sequence[Interaction]
     ) -> Tensor:
-        """Scores, [...], broadcast against [Q], after the tries of the history."""
+        """Scores, [...], broadcast against [Q], after the interactions of the history."""
         after = before
         features, places = self.adapter.features(observation, "prior", points), self.adapter.places(observation, points)
         for interaction in history:

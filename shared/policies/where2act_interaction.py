@@ -1,4 +1,4 @@
-"""Where2Act-interaction: Where2Act that is shown four tries at once.
+"""Where2Act-interaction: Where2Act with four interactions as an additional input.
 
 How it is trained stands in `learner.stages.where2act_interaction`.
 """
@@ -26,7 +26,7 @@ class Where2ActInteraction(Aap):
 
     @classmethod
     def starting_from(cls, prior: Prior) -> "Where2ActInteraction":
-        """One that says what the prior says, whatever was tried, until it is trained.
+        """A network that predicts the same as the prior, for any interactions, until it is trained.
 
         The weights of the branch are drawn from PyTorch's global random state.
         """

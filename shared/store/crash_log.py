@@ -1,15 +1,15 @@
-"""What is under way: a heartbeat of each worker's rollout, and the crash log of workers that crashed.
+"""Heartbeats of workers, and their crash logs.
 
-    STORE/underway/<process>.json    the rollout that this process executes at this moment
-    STORE/underway/<process>.fault   where it was when it crashed or hung; empty as long as all is well
+    STORE/underway/<process>.json    the heartbeat: the rollout that this process executes now
+    STORE/underway/<process>.fault   the traceback of a crash or a hang; empty otherwise
 
-They lie in the store since that is all that workers and driver are sure to share. A file is named by the process that
-wrote it, so that none is ever taken for another's, however many have tried the same rollout. Nothing here is forced to
-the disk: a heartbeat matters after the end of a process, not of a machine.
+These files are in the store, because the store is the only place that workers and driver are sure to share. A file is
+named after its process, so it cannot be mistaken for that of another worker on the same rollout. The files are not
+synced, because a heartbeat matters after the end of a process, not after the end of a machine.
 
-Of a store in a bucket the heartbeats lie there too, but crash log cannot: a handler of signals writes to an open file
-and no further. They stay on the worker's machine, in a folder of its user alone (`shared.io.private`), and a driver on
-another one takes a crash for a loss.
+The heartbeats of a store in a bucket are in the bucket. The crash logs are not, because a signal handler can only write
+to a local file: they stay on the worker's machine in a private folder (`shared.io.private`), and a driver on another
+machine treats a crash as a loss.
 """
 
 import hashlib
@@ -33,36 +33,35 @@ if TYPE_CHECKING:
 CRASH_LOG_FOLDER = "underway"
 
 _ABANDONED_S = 30 * DAY_S
-"""A worker of another machine may wait for its next job for days, while a policy is trained."""
+"""A worker on another machine may wait for its next job for days while a policy is trained."""
 _WORKER_SILENT_S = 600.0
-"""A worker says before each rollout what it does; hardly any takes longer."""
+"""A worker writes a heartbeat before each rollout, and hardly any rollout takes longer."""
 _HEARTBEAT, _FAULT = ".json", ".fault"
 _HEARTBEAT_BYTES = 256
 _MAX_BYTES = 1 << 16
 _FRAMES = 2
-"""Frames of a traceback that a reason names, from the innermost outwards."""
+"""Frames of a traceback in a reason, from the innermost outwards."""
 _FRAME = re.compile(r'  File "(?P<file>[^"]*)", line (?P<line>\d+) in (?P<function>.*)')
 _TIMEOUT = re.compile(r"Timeout \((?P<limit>[\d:.]+)\)!")
 
 
 class Heartbeat(StrictModel):
-    """What a process is doing."""
+    """The job and the rollout that a process executes."""
 
     shard_id: str = Field(max_length=100)
     """Of the job."""
     rollout: int | None = Field(ge=0)
-    """The one under way; None while the shard is written, and after that until the next job."""
+    """The running rollout; None while the shard is written, and until the next job."""
     written: float = Field(0.0, ge=0)
     """Seconds since 1970."""
 
 
 @dataclass(frozen=True, slots=True)
 class CrashLog:
-    """What is under way in one store.
+    """The heartbeats and crash logs of one store.
 
     Attributes:
-        folder: of the heartbeats and crash log; None: of a store in a bucket, whose crash log each machine keeps in
-            its user's private folder.
+        folder: of these files; None for a store in a bucket, whose crash logs are in a private folder of each machine.
         url: of a store in a bucket.
 
     Example:
@@ -74,11 +73,11 @@ class CrashLog:
     url: str = ""
 
     def leave(self, heartbeat: Heartbeat) -> None:
-        """Say what this process does now.
+        """Write the heartbeat of this process.
 
         Raises:
-            StoreError: the bucket is out of reach.
-            OSError: the file cannot be written; no older one is then left that would blame the wrong rollout.
+            StoreError: the bucket cannot be reached.
+            OSError: the file cannot be written; the older one, which has the wrong rollout, is removed.
         """
         if self.url:
             _place(self.url).replace(_key(process_name()), heartbeat.model_dump_json().encode())
@@ -94,10 +93,10 @@ class CrashLog:
             raise
 
     def open_fault_log(self) -> IO[bytes]:
-        """A file for the crash log of this process, as `faulthandler` writes them.
+        """Open the crash log of this process for `faulthandler`.
 
         Raises:
-            UsageError: there is no private folder on this machine, for a store in a bucket.
+            UsageError: the store is in a bucket, and this machine has no private folder.
             OSError: the file cannot be written.
         """
         file = self._file(process_name(), _FAULT)
@@ -105,32 +104,32 @@ class CrashLog:
         return os.fdopen(_open(file, os.O_TRUNC), "wb", buffering=0)
 
     def heartbeat_of(self, process: str) -> Heartbeat | None:
-        """What a process does, or did when it ended; None if it left no heartbeat, or half of one."""
+        """The last heartbeat of a process; None if it is missing or incomplete."""
         try:
             return Heartbeat.model_validate_json(self._read_heartbeat(process))
         except ValidationError:
             return None
 
     def heartbeats(self) -> dict[str, Heartbeat]:
-        """What each process does that has not been forgotten, by its name."""
+        """The heartbeats of all processes, by name."""
         names = _place(self.url).names(CRASH_LOG_FOLDER) if self.url else sorted(file.name for file in self._files())
         processes = [name.removesuffix(_HEARTBEAT) for name in names if name.endswith(_HEARTBEAT)]
         found = {process: self.heartbeat_of(process) for process in processes}
         return {process: heartbeat for process, heartbeat in found.items() if heartbeat is not None}
 
     def fault_of(self, process: str) -> str:
-        """Of what a process died, in one line; "" if nothing within it brought it about."""
+        """The cause of a process's crash in one line; "" if the process did not cause its own end."""
         return summary_of(self._read(process, _FAULT).decode(errors="replace"))
 
     def forget(self, process: str) -> None:
-        """Remove what a process left."""
+        """Remove the heartbeat and the crash log of a process."""
         if self.url:
             _place(self.url).remove(_key(process))
         for suffix in (_HEARTBEAT, _FAULT):
             self._file(process, suffix).unlink(missing_ok=True)
 
     def sweep(self) -> int:
-        """Remove what ended processes left, as far as that can be told; returns how many files that was."""
+        """Remove the files of processes that are known to have ended; returns how many files that was."""
         heartbeats = [process for process in self.heartbeats() if is_gone(process)] if self.url else []
         files = [file for file in self._files() if is_abandoned(file, file.stem, _ABANDONED_S)]
         for process in heartbeats:

@@ -1,8 +1,8 @@
-"""What lies where in a store, and the documents that describe it.
+"""The layout of a store, and the documents that describe it.
 
     STORE/
       store.json                     schema version, setting, software; written once
-      plans/<plan key>.json          who proposes
+      plans/<plan key>.json          the proposer and its policy
       shards/<shard id>/             complete if, and only if, manifest.json is there
         interactions.parquet         one row an interaction
         rollouts.parquet             one row a rollout
@@ -30,7 +30,7 @@ from shared.plan import Job, Setting
 from shared.store.codecs.checksummed import checked_content, has_checksum
 
 SCHEMA_VERSION = 1
-"""What the number promises, and when it grows, is told in docs/compatibility.md."""
+"""docs/compatibility.md says what the number promises and when it is increased."""
 HIDDEN_VERSION = 2
 """Of stores with further hidden parameters: software that knows version 1 alone would compute another digest."""
 DEPTH_VERSION = 3

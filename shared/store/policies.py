@@ -1,4 +1,4 @@
-"""Policies: what the learner publishes for the collectors, by version, immutable once there."""
+"""Policies, which the learner publishes for the collectors, by version; a version never changes."""
 
 import hashlib
 import re
@@ -17,7 +17,7 @@ _FILE_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,99}")
 
 
 class PolicyIndex(StrictModel):
-    """What a policy's folder holds."""
+    """The files of a policy, with sizes and checksums."""
 
     schema_version: int = SCHEMA_VERSION
     version: int
@@ -25,7 +25,7 @@ class PolicyIndex(StrictModel):
 
 
 def publish_policy(backend: StorageBackend, version: int, files: Mapping[str, bytes]) -> None:
-    """Put a policy's files into the store, all or none; publishing the same again changes nothing.
+    """Publish a policy's files atomically; publishing the same files again changes nothing.
 
     Raises:
         StoreError: the version or a file's name is not allowed, or the version exists with other content.
@@ -81,7 +81,7 @@ def version_of(backend: StorageBackend, files: Mapping[str, bytes], besides: Col
     Args:
         backend: of the store.
         files: of the policy.
-        besides: versions that do not count.
+        besides: versions to ignore.
 
     Raises:
         StoreError: an index is damaged.
@@ -105,7 +105,7 @@ def _read_index(backend: StorageBackend, version: int) -> PolicyIndex:
 
 
 def policy_versions(backend: StorageBackend) -> tuple[int, ...]:
-    """The versions that are published, in order."""
+    """The published versions, ascending."""
     versions = [int(name) for name in backend.names(POLICIES_FOLDER) if re.fullmatch(r"[0-9]{6}", name)]
     if backend.writes_in_place:
         versions = [version for version in versions if _folder(backend, version).has(INDEX_FILE)]

@@ -1,9 +1,9 @@
-"""Who is at work on a store: drivers, which may be several in a bucket, and whoever must be alone, such as a repair.
+"""Which processes work on a store: drivers (several in a bucket), or one that must be alone, such as a repair.
 
-A disk has locks for that. A bucket has none, so each holder there leaves a mark that it renews, and looks for others
-after its own is written: of two that come at the same time, at least one sees the other.
+A disk has locks for this. A bucket has none, so each process there writes a marker, renews it, and then looks for other
+markers. If two processes start at the same time, at least one sees the other.
 
-    STORE/status/driver-<process>-<n>.json    a mark; about the moment, so no data
+    STORE/status/driver-<process>-<n>.json    a marker; about the present state, so no data
 """
 
 import secrets
@@ -22,39 +22,39 @@ from shared.store.crash_log import workers_at_work
 from shared.store.layout import STATUS_FOLDER
 
 DRIVER = "driver"
-"""Name of the lock of whoever hands out jobs, and of whoever must not meet one."""
+"""Name of the lock of drivers, and of processes that must not run beside one."""
 BEAT_S = 5.0
 SILENT_S = 30.0
-"""A holder that has not renewed its mark for so long has ended; clocks of machines may differ by some seconds."""
+"""A process that has not renewed its marker for this long has ended; clocks may differ by some seconds."""
 _MAX_MARK_BYTES = 1 << 12
 
 
 class Mark(StrictModel):
-    """What a holder says of itself."""
+    """The marker of one process."""
 
     process: str = Field(max_length=200)
-    """As `shared.io.files.process_name` has it."""
+    """Its name by `shared.io.files.process_name`."""
     alone: bool
     """Whether it must be the only one."""
     written: float = Field(ge=0)
     """Seconds since 1970."""
 
     def is_alive(self, now: float) -> bool:
-        """Whether its process is at work, as far as that can be told from here."""
+        """Whether its process runs, as far as this machine can know."""
         return not is_gone(self.process) and now - self.written < SILENT_S
 
 
 @contextmanager
 def present(backend: StorageBackend, name: str, *, alone: bool) -> Iterator[None]:
-    """Hold a place without locks: leave a mark, look for others, and renew the mark as long as the context lasts.
+    """Hold a lock of a backend without locks: write a marker, look for others, and renew it during the context.
 
     Args:
-        backend: where the mark lies.
-        name: what is held.
-        alone: whether there must be no other holder; without it, there may be others of this kind.
+        backend: of the markers.
+        name: of the lock.
+        alone: whether no other process may hold it; otherwise there may be others that also allow this.
 
     Raises:
-        UsageError: another holder must be alone, or this one must and there is another.
+        UsageError: another process holds it, and one of the two must be alone.
     """
     own = f"{STATUS_FOLDER}/{name}-{process_name()}-{secrets.token_hex(4)}.json"
 
@@ -63,7 +63,7 @@ def present(backend: StorageBackend, name: str, *, alone: bool) -> Iterator[None
         backend.replace(own, mark.model_dump_json().encode())
 
     def renew() -> None:
-        # The work itself meets whatever is wrong with the place.
+        # The work itself reports problems of the backend.
         with suppress(StoreError):
             write()
 

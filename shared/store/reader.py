@@ -1,4 +1,4 @@
-"""Reading shards, which are hostile until their sizes, checksums, schemas and references have been checked."""
+"""Reading of shards, which are untrusted until sizes, checksums, schemas and references have been checked."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -50,7 +50,7 @@ _BATCH = 128
 
 
 def shard_folder(backend: StorageBackend, shard_id: str) -> Folder:
-    """Where a shard lies, or would."""
+    """The folder of a shard, which need not exist."""
     return Folder(backend, f"{SHARDS_FOLDER}/{shard_id}")
 
 
@@ -60,7 +60,7 @@ def is_committed(shard: Folder) -> bool:
 
 
 def named_jobs(backend: StorageBackend, plan_key: str | None = None) -> Iterator[Job]:
-    """The jobs that folders are called by, committed or not, in order of name."""
+    """The jobs of all shard folders, committed or not, sorted by name."""
     for name in backend.names(SHARDS_FOLDER):
         job = parse_shard_id(name)
         if job is not None and plan_key in (None, job.plan_key):
@@ -68,7 +68,7 @@ def named_jobs(backend: StorageBackend, plan_key: str | None = None) -> Iterator
 
 
 def committed_jobs(backend: StorageBackend, plan_key: str | None = None) -> list[Job]:
-    """The jobs whose shards are committed, in order of name, by the shards' names alone."""
+    """The jobs of all committed shards, sorted by name; no manifest is read."""
     found = []
     for jobs in _batches(named_jobs(backend, plan_key)):
         there = backend.exist([f"{SHARDS_FOLDER}/{job.shard_id}/{MANIFEST_FILE}" for job in jobs])
@@ -95,7 +95,7 @@ def read_manifest(shard: Folder) -> ShardManifest:
 
 
 def checked_manifest(shard: Folder, data: bytes) -> ShardManifest:
-    """The manifest of a shard, from hostile bytes.
+    """The manifest of a shard, from untrusted bytes.
 
     Raises:
         StoreError: it is damaged, foreign, of another schema version, or another shard's.
@@ -201,7 +201,7 @@ def _table(shard: Folder, manifest: ShardManifest, file: str, data: bytes, names
 
 
 def _check_interactions(table: Any, source: str, manifest: ShardManifest) -> None:
-    """See that the references of a shard's interactions lead to what the shard has."""
+    """Check that the references of a shard's interactions lead to what the shard has."""
     ranges = {
         "rollout": (manifest.start, manifest.stop),
         "observation": (0, manifest.observations),
@@ -220,7 +220,7 @@ def _check_interactions(table: Any, source: str, manifest: ShardManifest) -> Non
 
 
 def _check_rollouts(table: Any, source: str, manifest: ShardManifest) -> None:
-    """See that the rollouts of a shard add up to what the manifest says."""
+    """Check that the rollouts of a shard add up to what the manifest says."""
     clouds, tries, firsts, numbers = (table.column(name).to_numpy() for name in _COUNTING)
     most = max(manifest.observations, manifest.interactions)
     if min(clouds.min(), tries.min()) < 0 or max(clouds.max(), tries.max()) > most:

@@ -1,4 +1,4 @@
-"""What a store held at some moment: shards come to it while it is learnt from, and a training needs firm ground."""
+"""The rollouts of a store at one moment, because a training needs fixed data while collectors add shards."""
 
 from collections.abc import Iterable
 
@@ -9,14 +9,14 @@ from shared.store.coverage import Part
 
 
 class Snapshot(StrictModel):
-    """Rollouts by their numbers; shards are immutable, so that says all, also after a compaction."""
+    """Rollouts by their numbers. Shards are immutable, so the numbers suffice, also after a compaction."""
 
     ranges: dict[str, tuple[tuple[int, int], ...]] = Field(default_factory=dict)
     """Half-open, in order and apart, by plan."""
 
     @classmethod
     def of(cls, parts: Iterable[Part]) -> "Snapshot":
-        """What these parts of a store hold, which are in order of plan and rollout."""
+        """The rollouts of some parts of a store, sorted by plan and number."""
         ranges: dict[str, list[tuple[int, int]]] = {}
         for part in parts:
             known = ranges.setdefault(part.shard.plan_key, [])
@@ -26,11 +26,11 @@ class Snapshot(StrictModel):
 
     @property
     def rollouts(self) -> int:
-        """How many there are."""
+        """Number of rollouts."""
         return sum(stop - start for known in self.ranges.values() for start, stop in known)
 
     def limit(self, parts: Iterable[Part]) -> list[Part]:
-        """What of some parts of the store belongs to the snapshot."""
+        """The parts of the store, restricted to this snapshot."""
         kept = []
         for part in parts:
             for low, high in self.ranges.get(part.shard.plan_key, ()):

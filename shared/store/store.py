@@ -1,6 +1,6 @@
-"""The store as its users see it.
+"""The interface of a store for its users.
 
-store = Store.create(path, setting)                       # or opens it, if it holds the same setting
+store = Store.create(path, setting)                       # or opens a store with the same setting
 store.commit(plan, job, rollouts, {"physics_s": "6.1"})   # a worker, or many at once
 table = store.interactions(["point", "success"])          # a learner
 clouds = store.clouds(table)
@@ -58,7 +58,7 @@ _TABLES_AT_ONCE = 256
 
 
 class Store:
-    """A folder of immutable shards, all of one setting. Any number of processes may use it at once."""
+    """Immutable shards, all with one setting; any number of processes may use a store at the same time."""
 
     def __init__(self, backend: StorageBackend, document: StoreDocument) -> None:
         """Use `Store.create` or `Store.open`."""
@@ -69,7 +69,7 @@ class Store:
 
     @property
     def where(self) -> str:
-        """What people call the store's place: a folder or a URL; `Store.open` takes it."""
+        """The path or URL of the store, for messages and for `Store.open`."""
         return self.backend.where
 
     @property
@@ -79,7 +79,7 @@ class Store:
 
     @classmethod
     def create(cls, where: str | Path, setting: Setting, more: Mapping[str, Any] | None = None) -> "Store":
-        """Make a store, or open the one that is there.
+        """Create a store, or open an existing one with the same setting.
 
         Args:
             where: a folder, or s3://BUCKET/PREFIX.
@@ -114,7 +114,7 @@ class Store:
 
     @classmethod
     def open(cls, where: str | Path) -> "Store":
-        """Open a store that is there.
+        """Open an existing store.
 
         Args:
             where: a folder, or s3://BUCKET/PREFIX.
@@ -131,7 +131,7 @@ class Store:
         return cls(backend, parse_store_document(backend.read(STORE_FILE, MAX_DOCUMENT_BYTES), f"{where}/{STORE_FILE}"))
 
     def as_of(self, snapshot: Snapshot) -> "Store":
-        """The store as it was when it held these rollouts, for whoever reads it while others add to it."""
+        """The store restricted to these rollouts, for readers while others collect into it."""
         store = Store(self.backend, self.document)
         store._snapshot = snapshot
         return store
@@ -183,7 +183,7 @@ class Store:
     def manifests(self, plan_key: str | None = None) -> Iterator[ShardManifest]:
         """Manifests of the committed shards (of one plan), in order of plan and rollout; no data are read.
 
-        Shards whose rollouts larger ones hold as well, as a compaction leaves them until it ends, are left out.
+        Shards whose rollouts are also in a larger shard, as during a compaction, are left out.
 
         Raises:
             StoreError: a manifest is damaged or foreign.
@@ -191,9 +191,9 @@ class Store:
         return reader.read_manifests(self.backend, (part.shard for part in self.parts(plan_key)))
 
     def jobs(self, plan_key: str | None = None) -> list[Job]:
-        """The jobs (of one plan) whose shards are committed, by name; their ranges may overlap.
+        """The jobs (of one plan) of all committed shards, sorted by name; their ranges may overlap.
 
-        No manifest is read: of a million shards that would take a quarter of an hour, and their names take seconds.
+        No manifest is read, because a million manifests take a quarter of an hour, and a million names take seconds.
         """
         jobs = reader.committed_jobs(self.backend, plan_key)
         if not self.backend.exists(STORE_FILE):
@@ -239,19 +239,19 @@ class Store:
         *,
         vetted: bool = False,
     ) -> ShardManifest:
-        """Store the rollouts of a job as one shard: wholly or not at all, and once, however many workers try.
+        """Store the rollouts of a job as one shard: atomically, and only once if several workers do it.
 
         Args:
-            plan: whose job it is.
+            plan: the plan of the job.
             job: the range of rollouts.
             rollouts: all of them, in order.
-            provenance: what is known of how they were made, such as seconds by stage; not part of the digest.
-            quarantined: why rollouts of that status are; likewise no part of it.
-            vetted: whether a driver has seen that no shard holds these rollouts. Otherwise the names of all shards are
-                listed for it, which takes the longer the more there are. Readers count each rollout once in any case.
+            provenance: facts about their origin, such as seconds by stage; not part of the digest.
+            quarantined: the reasons of quarantined rollouts; not part of the digest.
+            vetted: whether the caller has checked that no shard has these rollouts. Otherwise the names of all shards
+                are listed, which takes longer for larger stores. Readers count each rollout once in any case.
 
         Returns:
-            The manifest; that of the shard which was there already, where another worker was faster.
+            The manifest; if another worker was faster, that of its shard.
 
         Raises:
             StoreError: the rollouts are not the job's, break the rules of a record, or overlap another shard.
@@ -280,11 +280,11 @@ class Store:
         return commit_shard(self.backend, job, rollouts, camera.points, provenance, quarantined, vetted=vetted)
 
     def only_driver(self, *, alone: bool = False) -> AbstractContextManager[Any]:
-        """Hold the store against other drivers, which would do everything twice.
+        """Lock the store against other drivers, which would repeat the same work.
 
         Args:
-            alone: also in a bucket, where several drivers of the same plan do no harm. Those that follow a learner may
-                hand out one number under two policies.
+            alone: also in a bucket, where several drivers of one plan do no harm. Drivers that follow a learner could
+                hand out one number with two policies.
 
         Raises:
             UsageError: another driver, or a repair, holds it; the message names the process.
@@ -292,7 +292,7 @@ class Store:
         return self.backend.only_one(DRIVER, alone=alone)
 
     def sweep(self) -> int:
-        """Remove what dead writers left unfinished; returns how many files and folders that was."""
+        """Remove unfinished files of dead writers; returns how many files and folders that was."""
         folders = ["", PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER]
         return self.backend.sweep(folders) + self.crash_log.sweep()
 
@@ -328,7 +328,7 @@ class Store:
         return self._table(INTERACTIONS_FILE, self.select(columns, where), plan_keys)
 
     def rollouts(self, columns: Sequence[str] | None = None, where: Sequence[Condition] = ()) -> Any:
-        """A pyarrow table, one row a rollout, those without interactions included; "shard" says where it is stored.
+        """A pyarrow table, one row a rollout, including those without interactions; "shard" is the name of its shard.
 
         Args:
             columns: names; None: all. "shard" always comes.
@@ -418,7 +418,7 @@ class Store:
         return reader.read_rollouts(shard, reader.read_manifest(shard))
 
     def publish_policy(self, version: int, files: Mapping[str, bytes]) -> None:
-        """Put a policy's files into the store, all or none; see `shared.store.policies`."""
+        """Publish a policy's files atomically; see `shared.store.policies`."""
         policies.publish_policy(self.backend, version, files)
 
     def read_policy(self, version: int) -> dict[str, bytes]:
@@ -426,30 +426,30 @@ class Store:
         return policies.read_policy(self.backend, version)
 
     def policy_versions(self) -> tuple[int, ...]:
-        """The versions that are published, in order."""
+        """The published versions, ascending."""
         return policies.policy_versions(self.backend)
 
     @property
     def path(self) -> Path:
-        """The folder of a store that lies on a disk.
+        """The folder of a store on a disk.
 
         Raises:
-            UsageError: it lies in a bucket.
+            UsageError: the store is in a bucket.
         """
         if is_url(self.where):
             raise UsageError(
-                f"{self.where}: lies in no folder; copy it by `adaafford store merge {self.where} --out DIR`"
+                f"{self.where}: is not in a folder; copy it by `adaafford store merge {self.where} --out DIR`"
             )
         return Path(self.where)
 
     @property
     def shards_folder(self) -> Path:
-        """Where shards lie; raises as `path` does."""
+        """The folder of the shards; raises as `path` does."""
         return self.path / SHARDS_FOLDER
 
     @property
     def crash_log(self) -> CrashLog:
-        """Where workers leave their heartbeats."""
+        """The heartbeats and crash logs of workers."""
         return CrashLog(None, self.where) if is_url(self.where) else CrashLog(self.path / CRASH_LOG_FOLDER)
 
     def _committed_shard(self, shard_id: str) -> Folder:

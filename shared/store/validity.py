@@ -1,4 +1,4 @@
-"""What a rollout must satisfy to be stored, and what is read must satisfy to be believed."""
+"""The rules of rollouts, which are checked before they are stored and after they are read."""
 
 import math
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ MAX_PARTS = 255
 
 
 def check_rollouts(rollouts: Sequence[RolloutRecord], job: Job, points: int, source: str) -> None:
-    """Hold the rollouts of a shard to the job that they came from and to the rules of a record.
+    """Check that the rollouts of a shard belong to its job and follow the rules of a record.
 
     Args:
         rollouts: in order.
-        job: the range of rollouts that they must be.
-        points: N, that every cloud must have.
-        source: what messages call them.
+        job: the range that they must have.
+        points: N, of every cloud.
+        source: their name in messages.
 
     Raises:
         StoreError: with the rollout, the step and what is wrong.
@@ -54,7 +54,7 @@ def check_rollouts(rollouts: Sequence[RolloutRecord], job: Job, points: int, sou
 
 
 def check_quarantined(rollouts: Sequence[RolloutRecord], quarantined: Sequence[Quarantined], source: str) -> None:
-    """Hold what a manifest says was given up to the rollouts themselves.
+    """Check the quarantined rollouts of a manifest against the rollouts.
 
     Raises:
         StoreError: a reason is given for a rollout that was executed.

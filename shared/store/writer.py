@@ -1,4 +1,4 @@
-"""Committing shards: all files of one, and its manifest last; the place knows how that is made all or nothing."""
+"""Commit of shards: all files of a shard, with its manifest last; the storage backend makes this atomic."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -37,11 +37,11 @@ from shared.store.validity import check_quarantined, check_rollouts
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """What newer software wrote of some rollouts, and this one keeps as it is.
+    """Columns and fields that newer software wrote, which are kept unchanged.
 
     Attributes:
-        tables: columns of the shard's two tables, by file (see `tables.unknown_columns`).
-        fields: of the manifest.
+        tables: unknown columns of the shard's two tables, by file (see `tables.unknown_columns`).
+        fields: unknown fields of the manifest.
     """
 
     tables: Mapping[str, Any]
@@ -59,17 +59,17 @@ def commit_shard(
     vetted: bool = False,
     unknown: Unknown | None = None,
 ) -> ShardManifest:
-    """Write a shard and commit it; where another worker was faster, its shard stays and its manifest is returned.
+    """Write and commit a shard; if another worker has committed it, return the manifest of that shard.
 
     Args:
         backend: of the store.
-        job: the rollouts that the shard holds.
-        rollouts: in order.
+        job: the range of rollouts.
+        rollouts: all rollouts of the job, in order.
         points: N, of every cloud.
-        provenance: what else is known of how they were made, such as seconds by stage.
-        quarantined: why rollouts of that status are.
-        vetted: whether it is known that it overlaps no other, or may, so that this need not be looked for.
-        unknown: what newer software wrote of these rollouts.
+        provenance: further facts about their origin, such as seconds by stage.
+        quarantined: the reasons of quarantined rollouts.
+        vetted: whether the caller has checked that the job overlaps no other shard, or allows an overlap.
+        unknown: columns and fields of newer software.
 
     Raises:
         StoreError: a rollout breaks the rules of a record, or the job overlaps another shard of its plan.
@@ -104,12 +104,12 @@ def commit_shard(
 
 
 def copy_shard(source: Folder, manifest: ShardManifest, backend: StorageBackend) -> None:
-    """Commit a shard of another place: its files to the last byte, and its manifest, also what is unknown of it.
+    """Commit a copy of a shard of another store: its files byte by byte, and its manifest with unknown fields.
 
     Args:
         source: the shard.
         manifest: its manifest.
-        backend: of the store that it is copied into; holds none of its rollouts, unless in a shard of this name.
+        backend: of the target store, which has none of its rollouts, except in a shard with this name.
 
     Raises:
         StoreError: the shard is damaged.
@@ -121,10 +121,10 @@ def copy_shard(source: Folder, manifest: ShardManifest, backend: StorageBackend)
 
 
 def commit_files(backend: StorageBackend, manifest: ShardManifest, files: Mapping[str, bytes]) -> None:
-    """Commit a shard whose files are encoded already; the manifest's entries for them are made here.
+    """Commit a shard whose files are already encoded; the manifest's entries for them are made here.
 
     Raises:
-        StoreError: what was committed cannot be read, or holds other rollouts than the manifest says.
+        StoreError: the committed files cannot be read, or their rollouts do not match the manifest.
     """
     whole = manifest.model_copy(update={"files": _entries(files)})
     _publish(backend, whole, files, vetted=True)
@@ -155,7 +155,7 @@ def _publish(backend: StorageBackend, manifest: ShardManifest, files: Mapping[st
 
 
 def _without_places(manifest: ShardManifest) -> ShardManifest:
-    """The manifest without a host's name and paths, which older software wrote into those that are copied here."""
+    """The manifest without host name and paths, which manifests of older software have."""
     provenance = {name: value for name, value in manifest.provenance.items() if name != "host"}
     quarantined = tuple(
         each.model_copy(
@@ -196,10 +196,10 @@ def _entries(files: Mapping[str, bytes]) -> dict[str, FileEntry]:
 
 
 def _check_taken_over(shard: Folder, manifest: ShardManifest) -> None:
-    """Files of another attempt at the same job hold the same rollouts, though not the same wall times."""
+    """Check that files of another attempt have the same rollouts; their wall times differ."""
     digests = tuple(rollout_digest(rollout) for rollout in read_rollouts(shard, manifest))
     if digests != manifest.digests:
-        raise StoreError(f"{shard}: files of another attempt lie here, of other content; run `adaafford store repair`")
+        raise StoreError(f"{shard}: has files of another attempt with other content; run `adaafford store repair`")
 
 
 def _refuse_overlap(backend: StorageBackend, job: Job) -> None:

@@ -293,7 +293,7 @@ def test_an_export_leaves_other_files_alone(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("")
     assert adaafford(["export-policy", str(run.path), "--out", str(tmp_path / "mine")]) == 2
-    assert "holds something that is no exported policy" in capsys.readouterr().err
+    assert "holds something that is not an exported policy" in capsys.readouterr().err
 
 
 # The loop.
@@ -316,7 +316,7 @@ def test_a_session_fills_its_history_and_then_acts(policy_folder: Path, scan: Pa
 
 
 def test_a_scan_that_was_written_over_is_noticed(policy_folder: Path, scan: Path) -> None:
-    """A robot that saves every scan under one name would tell the policy of tries on what it never saw."""
+    """A robot that saves every scan under one name would give the policy interactions with scans that it never saw."""
     live = session(policy_folder, scan)
     live.step(scan)
     np.savez(scan, points=front(seed=2))
@@ -324,7 +324,7 @@ def test_a_scan_that_was_written_over_is_noticed(policy_folder: Path, scan: Path
     assert renewed.tries == 0
     live.step(scan, TriedOutcome(motion=0.2))
     np.savez(scan, points=front(seed=3))
-    with pytest.raises(UsageError, match="give every scan a name of its own"):
+    with pytest.raises(UsageError, match="use a new file name for every scan"):
         live.step(scan, TriedOutcome(motion=0.2))
     later = scan.with_name("scan-2.npz")
     scan.rename(later)
@@ -371,7 +371,7 @@ def test_misuse_is_refused_and_changes_nothing(policy_folder: Path, scan: Path, 
     with pytest.raises(UsageError, match="was begun with up"):
         session(policy_folder, scan, up=(0.0, 1.0, 0.0)).step(scan)
     np.savez(tmp_path / "elsewhere.npz", points=front())
-    with pytest.raises(UsageError, match="does not lie beside the history"):
+    with pytest.raises(UsageError, match="is not in the folder of the history"):
         session(policy_folder, scan).step(tmp_path / "elsewhere.npz")
     scan.with_name("loop.npz").symlink_to("loop.npz")
     for name in (f"{'x' * 300}.npz", "loop.npz"):
@@ -488,7 +488,7 @@ def test_a_request_is_read(line: bytes) -> None:
     ("line", "expected"),
     [
         (b"\xff\xfe{\0", "UTF-16"),
-        (b'{"cloud": "a.ply", "cloud": "b.ply"}', "the name 'cloud' stands twice"),
+        (b'{"cloud": "a.ply", "cloud": "b.ply"}', "the name 'cloud' occurs twice"),
         (b'{"cloud": "a\\u001b.ply"}', "cloud: Value error, needs a name without control characters"),
         (b'{"cloud": "a.ply", "outcome": {"motion": NaN}}', "outcome.motion"),
         (b"[" * 60_000, "Invalid JSON"),
@@ -518,7 +518,7 @@ def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
         (["--outcome", "0", "--grasp-width", "20"], "--outcome: setting 'grasp_width'"),
         (["--outcome", "0", "--grasp-width", "nan"], "--outcome: setting 'grasp_width'"),
         (["--out", "heat.obj"], "not a kind of heatmap"),
-        (["--budget", "0"], "at least one try"),
+        (["--budget", "0"], "at least one interaction"),
         (["--points", "9"], "allowed are 64 to 16384"),
     ):
         assert adaafford(["adapt", *where, *wrong]) == 2

@@ -614,8 +614,8 @@ def test_a_history_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     [
         (HISTORY.encode("utf-16"), "is text in UTF-16; save it in UTF-8"),
         (b"\xff\xfe", "UTF-16"),
-        (HISTORY.encode().replace(b'"motion"', b'"motion": 0.1, "motion"'), "the name 'motion' stands twice"),
-        (HISTORY.encode().replace(b'"frame"', b'"frame": {"origin": [0, 0, 0]}, "frame"'), "'frame' stands twice"),
+        (HISTORY.encode().replace(b'"motion"', b'"motion": 0.1, "motion"'), "the name 'motion' occurs twice"),
+        (HISTORY.encode().replace(b'"frame"', b'"frame": {"origin": [0, 0, 0]}, "frame"'), "'frame' occurs twice"),
         (HISTORY.encode().replace(b"0.21", b"NaN"), "interactions.0.outcome.motion"),
         (HISTORY.encode().replace(b"0.21", b"1e999"), "interactions.0.outcome.motion"),
         (HISTORY.encode().replace(b"0.21", b"1" * 5000), "number out of range"),

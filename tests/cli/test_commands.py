@@ -100,7 +100,7 @@ def test_aip_needs_a_policy(capsys: pytest.CaptureFixture[str], tmp_path: Path) 
 
 def test_a_folder_with_something_else_is_left_alone(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("")
-    assert "holds something that is no run" in complaint(capsys, "run", "--out", str(tmp_path))
+    assert "holds something that is not a run" in complaint(capsys, "run", "--out", str(tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 

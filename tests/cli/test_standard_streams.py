@@ -240,4 +240,4 @@ def test_what_the_system_refuses_is_one_line(
 
     assert main.guarded(full, ["run"]) == 1
     said = capsys.readouterr().err
-    assert said == "adaafford: runs/a/log.jsonl: No space left on device; see to this and run the same command again\n"
+    assert said == "adaafford: runs/a/log.jsonl: No space left on device; correct this and run the same command again\n"

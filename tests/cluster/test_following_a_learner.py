@@ -155,35 +155,35 @@ def test_each_number_is_handed_out_once_in_jobs_of_one_plan(
 ) -> None:
     first = (version for version, times in enumerate(switches, 1) for _ in range(times))
     versions = itertools.chain(first, itertools.count(len(switches) + 1))
-    series = RolloutQueue(lambda: plan_of(next(versions)), missing_ranges(40, done), per_shard, per_plan)
-    orders = []
-    while not series.ended:
-        order = series.take()
-        if order is not None:
-            orders.append(order)
-    numbers = [number for order in orders for number in range(order.job.start, order.job.stop)]
+    queue = RolloutQueue(lambda: plan_of(next(versions)), missing_ranges(40, done), per_shard, per_plan)
+    taken = []
+    while not queue.ended:
+        planned = queue.take()
+        if planned is not None:
+            taken.append(planned)
+    numbers = [number for planned in taken for number in range(planned.job.start, planned.job.stop)]
     assert sorted(numbers) == sorted(set(range(40)) - {n for low, high in done for n in range(low, high)})
     assert len(numbers) == len(set(numbers))
-    assert all(order.job.plan_key == order.plan.key for order in orders)
-    assert all(order.job.stop - order.job.start <= per_shard for order in orders)
-    made = Counter(order.plan.key for order in orders for _ in range(order.job.start, order.job.stop))
+    assert all(planned.job.plan_key == planned.plan.key for planned in taken)
+    assert all(planned.job.stop - planned.job.start <= per_shard for planned in taken)
+    made = Counter(planned.plan.key for planned in taken for _ in range(planned.job.start, planned.job.stop))
     assert per_plan is None or max(made.values(), default=0) <= per_plan
 
 
-def test_a_successor_is_in_force_within_the_bound_and_versions_never_go_back(store: Store) -> None:
+def test_a_new_policy_takes_effect_within_the_bound_and_versions_never_go_back(store: Store) -> None:
     now = 0.0
-    adopted: list[int] = []
-    in_force = PolicySource(store, "aip", None, lambda plan: adopted.append(plan.policy_version), lambda: now)
-    assert in_force() is None
+    announced: list[int] = []
+    policy_source = PolicySource(store, "aip", None, lambda plan: announced.append(plan.policy_version), lambda: now)
+    assert policy_source() is None
     publish(store, 2)
     publish(store, 1)
     now += LOOK_S
-    assert in_force() == plan_of(2)
+    assert policy_source() == plan_of(2)
     publish(store, 3)
-    assert in_force() == plan_of(2)
+    assert policy_source() == plan_of(2)
     now += LOOK_S
-    assert in_force() == plan_of(3)
-    assert adopted == [2, 3]
+    assert policy_source() == plan_of(3)
+    assert announced == [2, 3]
 
 
 @pytest.mark.usefixtures("at_once")

@@ -280,7 +280,7 @@ def test_a_dead_process_leaves_its_last_words_until_they_are_swept(tmp_path: Pat
         "from collector.watchdog import Limits, Watchdog; from shared.io.files import process_name\n"
         "from shared.plan import Job; from shared.store.crash_log import CrashLog\n"
         "guard = Watchdog(CrashLog(pathlib.Path(sys.argv[1])), Limits())\n"
-        "guard.stand(); print(process_name(), flush=True)\n"
+        "guard.install(); print(process_name(), flush=True)\n"
         "with guard.job(Job('random-v0', 4, 8)) as under_way: under_way(5); ctypes.string_at(0)"
     )
     done = subprocess.run(
@@ -324,7 +324,7 @@ def test_crashes_hangs_and_kills_cost_themselves_alone_on_ray(tmp_path: Path) ->
     assert reasons[1].startswith("Segmentation fault, in string_at ")
     assert reasons[6].startswith("took more than 0:00:02, in execute (misbehaving_worker.py:")
     assert reasons[7] == "RuntimeError: the engine exploded (3 times)"
-    assert reasons[10].startswith("its process was lost without a word")
+    assert reasons[10].startswith("its process was lost without a traceback")
 
 
 @pytest.mark.slow

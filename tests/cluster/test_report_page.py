@@ -221,7 +221,7 @@ def test_the_page_shows_everything_and_stays_small(html: str, elements: Elements
     assert len(html) < 10 << 20
     assert html.count("plotly.js v") == 1
     assert "40\u201362" in html, "the interval of the F-score, percent"
-    assert "judged on 3 others" in html, "the objects that there were trials of"
+    assert "evaluated on 3 others" in html, "the objects that there were trials of"
     assert "adaafford report" in html, "how to have the hidden facts tried"
 
 

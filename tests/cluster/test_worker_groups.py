@@ -153,13 +153,13 @@ class Slow(Listed):
         return super().take()
 
 
-def test_orders_that_are_not_there_yet_are_asked_for_again(worker_group: WorkerGroup) -> None:
+def test_a_queue_that_has_no_job_yet_is_asked_again(worker_group: WorkerGroup) -> None:
     job_results: list[JobResult] = []
     worker_group.run(Slow(5), job_results.append)
     assert sorted(job_result.shard_id for job_result in job_results) == [job.shard_id for job in jobs(5)]
 
 
-def test_orders_are_taken_no_earlier_than_somebody_is_free_for_them(worker_group: WorkerGroup) -> None:
+def test_jobs_are_taken_no_earlier_than_a_worker_is_free(worker_group: WorkerGroup) -> None:
     orders, done = Slow(12), 0
 
     def count(job_result: JobResult) -> None:
@@ -247,7 +247,7 @@ def test_a_rollout_whose_process_is_always_killed_is_quarantined_at_last(
     (tmp_path / "die-1").write_text("99")
     assert run(ray_worker_group, 3) == [job.shard_id for job in jobs(3)]
     assert begun(tmp_path, jobs(3)[1]) == MAX_LOSSES + 1
-    assert "killed from outside, or for want of memory" in (tmp_path / "quarantined-1").read_text()
+    assert "killed from outside, or out of memory" in (tmp_path / "quarantined-1").read_text()
 
 
 def test_processes_killed_at_random_are_no_rollouts_fault(
@@ -278,7 +278,7 @@ def test_an_actor_holds_at_most_two_jobs(ray_worker_group: WorkerGroup, tmp_path
     def watch(job_result: JobResult) -> None:
         nonlocal most
         slots = ray_worker_group._slots  # type: ignore[attr-defined]
-        most = max(most, *(len(slot.orders) for slot in slots))
+        most = max(most, *(len(slot.planned_jobs) for slot in slots))
 
     ray_worker_group.run(Listed(plan(), jobs(12)), watch)
     assert most <= 2
@@ -293,7 +293,7 @@ def test_an_interrupt_leaves_no_actor_at_work(ray_worker_group: WorkerGroup, tmp
             ray_worker_group.run(Listed(plan(), jobs(4)), lambda job_result: os.kill(os.getpid(), signal.SIGINT))
     finally:
         signal.signal(signal.SIGINT, before)
-    assert not any(slot.orders for slot in ray_worker_group._slots)  # type: ignore[attr-defined]
+    assert not any(slot.planned_jobs for slot in ray_worker_group._slots)  # type: ignore[attr-defined]
 
 
 class InstantActor:

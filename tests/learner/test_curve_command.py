@@ -63,7 +63,7 @@ def test_trainings_are_judged_between_where2act_and_the_oracle(
     assert list(told["gains"]) == ["privileged"]
     with (tmp_path / CSV_FILE).open() as file:
         assert len(list(csv.DictReader(file))) == len(told["rows"])
-    assert "AAP, tries by AIP" in (tmp_path / MARKDOWN_FILE).read_text()
+    assert "AAP, interactions by AIP" in (tmp_path / MARKDOWN_FILE).read_text()
     assert (tmp_path / FIGURE_FILE).read_bytes().startswith(b"\x89PNG")
 
 

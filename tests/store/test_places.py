@@ -17,8 +17,8 @@ from shared.plan import Job, Plan
 from shared.records import RolloutRecord
 from shared.store import Store, check_place, info, verify
 from shared.store.backends.base import StorageBackend, Transaction, backend_of
-from shared.store.backends.local import DiskPlace
-from shared.store.backends.s3 import BucketPlace
+from shared.store.backends.local import LocalBackend
+from shared.store.backends.s3 import S3Backend
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting, identical
 
 SETTING = fabricate_setting()
@@ -243,7 +243,7 @@ def test_a_server_that_fails_is_asked_again(s3_url: str, monkeypatch: pytest.Mon
 
 
 def test_a_bucket_place_needs_no_locks(s3_url: str) -> None:
-    place = BucketPlace.of(s3_url)
+    place = S3Backend.of(s3_url)
     with place.only_one("driver"), place.only_one("driver"):
         assert place.sweep(["", "shards"]) == 0
 
@@ -253,13 +253,13 @@ def test_one_of_several_writers_wins_and_the_check_leaves_nothing_behind(place: 
     assert place.leaves("") == []
 
 
-class ForgetsTheCondition(DiskPlace):
+class ForgetsTheCondition(LocalBackend):
     def create(self, key: str, data: bytes) -> bool:
         self.replace(key, data)
         return True
 
 
-class LooksAndThenWrites(DiskPlace):
+class LooksAndThenWrites(LocalBackend):
     """As servers do that read the condition, take the data, and write: with writers that all look before one writes."""
 
     looked = threading.Barrier(4)
@@ -272,7 +272,7 @@ class LooksAndThenWrites(DiskPlace):
         return not found
 
 
-class KeepsTheLast(DiskPlace):
+class KeepsTheLast(LocalBackend):
     """Tells one writer that it won, and keeps what another wrote."""
 
     def create(self, key: str, data: bytes) -> bool:
@@ -282,17 +282,17 @@ class KeepsTheLast(DiskPlace):
         return won
 
 
-class ListsLate(DiskPlace):
+class ListsLate(LocalBackend):
     def names(self, folder: str) -> list[str]:
         return []
 
 
-class RemovesLater(DiskPlace):
+class RemovesLater(LocalBackend):
     def remove(self, key: str) -> None:
         return
 
 
-class LosesAll(DiskPlace):
+class LosesAll(LocalBackend):
     def create(self, key: str, data: bytes) -> bool:
         super().create(key, data)
         return False
@@ -310,18 +310,18 @@ class LosesAll(DiskPlace):
     ],
 )
 def test_a_place_that_breaks_a_promise_is_found_out(
-    kind: Callable[[Path], DiskPlace], what: str, tmp_path: Path
+    kind: Callable[[Path], LocalBackend], what: str, tmp_path: Path
 ) -> None:
     with pytest.raises(StoreError, match=f"{what}.*a bucket needs a server that obeys"):
         check_place(kind(tmp_path), writers=4)
 
 
 def test_no_store_is_created_in_a_bucket_where_every_writer_wins(s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def forgets(self: BucketPlace, key: str, data: bytes) -> bool:
+    def forgets(self: S3Backend, key: str, data: bytes) -> bool:
         self.replace(key, data)
         return True
 
-    monkeypatch.setattr(BucketPlace, "create", forgets)
+    monkeypatch.setattr(S3Backend, "create", forgets)
     with pytest.raises(StoreError, match=r"8 of 8 concurrent writers .* could lose data"):
         Store.create(s3_url, SETTING)
     assert backend_of(s3_url).leaves("") == []

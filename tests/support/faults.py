@@ -16,7 +16,7 @@ from typing import Any
 
 from obstore.exceptions import GenericError, PermissionDeniedError
 
-from shared.store.backends.s3 import BucketPlace
+from shared.store.backends.s3 import S3Backend
 
 DISK_CALLS = ("open", "write", "fsync", "mkdir", "rename", "link", "unlink", "rmdir")
 BUCKET_CALLS = ("put", "copy", "delete")
@@ -160,13 +160,13 @@ class _FaultyPages:
 @contextmanager
 def bucket_faults(fault: Fault, calls: Collection[str] = BUCKET_CALLS) -> Iterator[list[str]]:
     """Let a step of writing to a bucket fail, or of other calls, in places that are opened within the context."""
-    init = BucketPlace.__init__
+    init = S3Backend.__init__
 
-    def faulty(self: BucketPlace, where: str, client: Any) -> None:
+    def faulty(self: S3Backend, where: str, client: Any) -> None:
         init(self, where, _FaultyClient(client, fault, calls))
 
     try:
-        BucketPlace.__init__ = faulty  # type: ignore[method-assign]
+        S3Backend.__init__ = faulty  # type: ignore[method-assign]
         yield fault.steps
     finally:
-        BucketPlace.__init__ = init  # type: ignore[method-assign]
+        S3Backend.__init__ = init  # type: ignore[method-assign]

@@ -131,8 +131,8 @@ def speedup(plan: Plan, folder: Path, rollouts: int, repeats: int, workers: int,
         for turn in range(repeats + 1):
             for worker_group, wall in zip(worker_groups, walls, strict=True):
                 begun = time.perf_counter()
-                orders = RolloutQueue(lambda: plan, [(turn * rollouts, (turn + 1) * rollouts)], ROLLOUTS_PER_SHARD)
-                worker_group.run(orders, lambda _: None)
+                queue = RolloutQueue(lambda: plan, [(turn * rollouts, (turn + 1) * rollouts)], ROLLOUTS_PER_SHARD)
+                worker_group.run(queue, lambda _: None)
                 wall.append(time.perf_counter() - begun)
                 advance()
         alone, together = (wall[1:] for wall in walls)

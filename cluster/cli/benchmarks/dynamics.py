@@ -1,4 +1,4 @@
-"""Do hidden dynamics matter? Base rates of random actions, and how often the same action hangs on the draw."""
+"""Base rates of random actions, and how often the outcome of an action depends on the hidden dynamics."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence

@@ -22,44 +22,44 @@ MIN_SHOWN, MAX_SHOWN = 64, 16384
 
 @dataclass(frozen=True, slots=True)
 class AdaptCommand:
-    """Say what to try next on a scanned object, and where it can be moved, given what was tried so far.
+    """Propose the next interaction with a scanned object, and predict where it can be moved, given its history.
 
     Prints one JSON object: what to do ("try" or "act"), and point, approach and forward direction in the scan's frame.
-    Tell what came of it by --outcome, with the next scan, or by writing it into the history. docs/robot.md has the
-    frames and the history's schema.
+    Give its outcome by --outcome, with the next scan, or write it into the history. docs/robot.md describes the frames
+    and the history's schema.
     """
 
     cloud: Path
-    """A scan of the object as it stands (.ply, .npz or .pcd): metres, the object alone."""
+    """A scan of the object in its present state (.ply, .npz or .pcd): metres, only the object."""
     history: Path
-    """The tries so far (JSON); made where it is not there. Scans lie beside it or below."""
+    """The interactions so far (JSON), created if missing. Scans are in the same folder or below."""
     policy: str | None = None
-    """A name of those that the package brings, a folder with weights.safetensors and policy.json, or a finished run.
-    Where none is given, the only one that the package brings."""
+    """The name of a bundled policy, a folder with weights.safetensors and policy.json, or a finished run. Default: the
+    bundled policy, if there is only one."""
     out: Path | None = None
-    """Where the adapted affordance goes: .ply, .npz or .html; heatmap.ply beside the history where none is given."""
+    """File for the adapted affordance: .ply, .npz or .html; default: heatmap.ply beside the history."""
     outcome: float | None = None
-    """How far the part moved in what the last call proposed: rad if it turns, m if it slides, 0 for nothing."""
+    """How far the part moved in the interaction of the last call: rad if it turns, m if it slides, 0 for no motion."""
     kind: OutcomeKind = OutcomeKind.UNKNOWN
-    """How that try ended, such as "ok", "no-contact" or "no-grasp"."""
+    """How that interaction ended, such as "ok", "no-contact" or "no-grasp"."""
     grasp_width: float | None = None
-    """How far the fingers stayed open together when they had closed in that try, m."""
+    """Opening of the two fingers together after they closed in that interaction, m."""
     success: bool | None = None
-    """Whether it moved as intended; where nothing is said, whether it moved by more than 0.01."""
+    """Whether the part moved as intended; default: whether it moved by more than 0.01."""
     up: tuple[float, float, float] | None = None
-    """The direction against gravity in the scan's frame: 0 0 1 where neither this nor the history says. A camera that
-    looks ahead, with x right, y down and z forward, has 0 -1 0."""
+    """The direction against gravity in the scan's frame; default: the history's, otherwise 0 0 1. A level camera with x
+    right, y down and z forward has 0 -1 0."""
     camera: tuple[float, float, float] | None = None
-    """Where the camera stood in the scan's frame: 0 0 0 where neither this nor the scan nor the history says."""
+    """The camera position in the scan's frame; default: that of the history or the scan, otherwise 0 0 0."""
     budget: int = 4
-    """How many tries may be proposed before it says how to act."""
+    """The most interactions that are proposed before the final action."""
     points: int = 2048
-    """How many points of a scan the policy is shown: as many as it was trained with, which its card says."""
+    """How many points of a scan the policy receives: as many as in its training (see its model card)."""
     seed: int = 0
-    """Of what is drawn."""
+    """Of the random draws."""
     follow: bool = False
-    """Go on: for each line {"cloud": "scan-2.ply", "outcome": {"motion": 0.2}} on the standard input, print the next
-    step. A step then takes a fraction of a second, since nothing is loaded anew."""
+    """Keep running: for each line {"cloud": "scan-2.ply", "outcome": {"motion": 0.2}} on standard input, print the next
+    step. A step then takes a fraction of a second, because the policy stays loaded."""
 
 
 def main(args: list[str]) -> int:
@@ -71,7 +71,7 @@ def main(args: list[str]) -> int:
             "--success, --kind and --grasp-width say how an outcome is meant; give --outcome MOTION with them"
         )
     if command.budget < 1:
-        raise UsageError(f"--budget {command.budget}: at least one try is needed to adapt")
+        raise UsageError(f"--budget {command.budget}: at least one interaction is needed to adapt")
     if not MIN_SHOWN <= command.points <= MAX_SHOWN:
         raise UsageError(f"--points {command.points}: allowed are {MIN_SHOWN} to {MAX_SHOWN}")
     if command.seed < 0:

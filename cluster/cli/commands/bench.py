@@ -55,48 +55,48 @@ class StoredSettings(BenchSettings):
     """Settings of benchmarks that need stored interactions."""
 
     task: str = "push-faucet"
-    """Of the store that is made where none is given."""
+    """Task of the store that is created if none is given."""
     procedural_per_category: int = Field(8, ge=1, le=10_000)
     """Its built-in objects: how many of each category that the task applies to."""
     store: str | None = None
-    """Folder or s3:// URL of a store to read; a small one is made where none is given."""
+    """Folder or s3:// URL of a store to read; default: a small one is created."""
     rollouts: int = Field(32, ge=2, le=1_000_000)
-    """Of the store that is made."""
+    """Seed of the created store."""
     threads: int | None = Field(None, ge=1, le=1024)
     """Of PyTorch; unset: as many as it chooses."""
 
 
 class FidelitySettings(BenchSettings):
-    """Execute the same trials in two fidelities, and say how far they agree."""
+    """Execute the same trials in two fidelities, and print how well they agree."""
 
     trials: int = Field(200, ge=1, le=1_000_000)
     """How many."""
     reference: Fidelity = FIDELITIES["reference"]
-    """The truth: the published timing."""
+    """The reference: the published timing."""
     candidate: Fidelity = FIDELITIES["fast"]
-    """What is judged: what collection uses by default."""
+    """The fidelity that is compared: the default of collections."""
 
 
 class DynamicsSettings(BenchSettings):
-    """Say how often random actions succeed, and how often the outcome of an action depends on the hidden dynamics."""
+    """Print how often random actions succeed, and how often an outcome depends on the hidden dynamics."""
 
     rollouts: int = Field(60, ge=1, le=1_000_000)
     """One object and one state each."""
     draws: int = Field(6, ge=2, le=1000)
-    """Of hidden dynamics, under which every (state, action) pair is tried."""
+    """Draws of hidden dynamics; every (state, action) pair is executed under each."""
     actions: int = Field(6, ge=1, le=1000)
-    """Tried from each state."""
+    """Actions from each state."""
 
 
 class CollectSettings(BenchSettings):
-    """Time collection by stage, and say what further workers bring."""
+    """Time collection by stage, and print the gain from more workers."""
 
     rollouts: int = Field(120, ge=1, le=1_000_000)
     """Of each repeat: enough that most objects come again, as they do hundreds of times in a large collection."""
     repeats: int = Field(3, ge=1, le=1000)
     """The median of these counts."""
     workers: int = Field(1, ge=1, le=256)
-    """With more than one, the speed-up of so many Ray workers over one is measured as well."""
+    """With more than one, the speed-up of this many Ray workers over one is measured as well."""
 
 
 class LearnerSettings(StoredSettings):

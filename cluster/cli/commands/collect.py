@@ -1,4 +1,4 @@
-"""`adaafford collect`: collection alone, into one store."""
+"""`adaafford collect`: a collection into one store."""
 
 import logging
 import sys
@@ -24,29 +24,29 @@ logger = logging.getLogger(__name__)
 
 
 class CollectSettings(ObjectSelection):
-    """What `adaafford collect` may be told by a file as well."""
+    """Settings of `adaafford collect` that a file may contain as well."""
 
     task: str = "push"
     """Which manipulation task: push, pull, pull-closed-door, push-faucet, one that a package adds, or a TOML file."""
     rollouts: int = Field(100, ge=1)
-    """How many the store shall hold of this plan, those of earlier attempts included; with --policy latest, of this
-    proposer with any policy."""
+    """How many rollouts of this plan the store has in the end, including earlier attempts; with --policy latest, of
+    this proposer with any policy."""
     per_version: int | None = Field(None, ge=1)
-    """With --policy latest: rollouts that one version proposes at the most; then the next one is waited for (rounds).
-    Without it, each version proposes until there is a newer one (continuous collection)."""
+    """With --policy latest: the most rollouts of one version; then the collection waits for the next version (rounds).
+    Without it, a version is used until there is a newer one (continuous collection)."""
     per_shard: int = Field(ROLLOUTS_PER_SHARD, ge=1, le=4096)
-    """Rollouts a shard."""
+    """Rollouts in each shard."""
     seed: int = Field(1, ge=0, lt=2**63)
-    """Everything random derives from it."""
+    """All randomness is derived from it."""
     workers: int = Field(2, ge=0, le=4096)
-    """Ray actors, one CPU each; 0 does everything in one process without Ray."""
+    """Ray actors, one CPU each; 0: one process without Ray."""
     ray_address: RayAddress | None = None
-    """Of a running Ray cluster; a private session on this machine where none is given."""
+    """HOST:PORT of a running Ray cluster, or auto; default: a private session on this machine."""
     rollout_limit_s: float = Field(300.0, gt=0)
-    """A worker that takes longer for one rollout is taken for hung, and replaced; after three times the rollout is
+    """A worker that takes longer for one rollout is replaced as hung; after three times the rollout is
     quarantined."""
     memory_limit_mb: float = Field(2000.0, gt=0)
-    """What a worker may take beyond what it had after its start; at half of that it is replaced after its job."""
+    """How much a worker's memory may grow after its start; at half of this it is replaced after its job."""
     procedural_per_category: int = Field(8, ge=1, le=10_000)
     """Built-in objects: how many of each category that the task applies to."""
     collection: CollectionConfig = CollectionConfig()
@@ -54,20 +54,20 @@ class CollectSettings(ObjectSelection):
 
 @dataclass(frozen=True, slots=True)
 class CollectCommand:
-    """Collect interactions into a store. The same command again goes on where it was stopped."""
+    """Collect interactions into a store. Give the same command again to continue."""
 
     settings: Annotated[CollectSettings, tyro.conf.arg(name="")]
     store: str
     """Folder or s3:// URL of the store: new, or of the same setting."""
     proposer: str = RANDOM
-    """Who chooses the interactions: random, aip, or another that the package or an installed one has."""
+    """The proposer: random, aip, another of this package, or one of an installed package."""
     policy: int | Literal["latest"] = 0
-    """Version of the policy in the store that the proposer uses; "random" needs none, "aip" does. "latest": always the
-    newest that is published, also by a learner that is at work at the same time (`adaafford learn --follow`)."""
+    """Version of the policy in the store that the proposer uses; "random" needs none, "aip" needs one. "latest": always
+    the newest published one, also by a learner at the same time (`adaafford learn --follow`)."""
     retry_quarantined: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Execute the rollouts again that the store holds as quarantined, once what made them fail was mended."""
+    """Execute the quarantined rollouts again, after their cause was corrected."""
     config: Path | None = None
-    """A TOML file of settings; flags are laid over it."""
+    """A TOML file of settings; flags replace them."""
 
 
 def main(args: list[str]) -> int:
@@ -137,7 +137,9 @@ def run_collection(command: CollectCommand) -> None:
     )
     store = Store.create(where, setting)
     if changed := changed_versions(store.document.software):
-        print(f"{store.where}: begun with other software: {changed}; what is added may differ by it", file=sys.stderr)
+        print(
+            f"{store.where}: begun with other software: {changed}; new rows may differ because of it", file=sys.stderr
+        )
     plan: Plan | Newest
     if command.policy == "latest":
         plan = Newest(command.proposer, chosen.per_version)

@@ -16,8 +16,8 @@ class CompareCommand:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs, such as seeds of one campaign."""
     evaluation: str | None = None
-    """How the name of a folder in each RUN/evaluations begins, made by `adaafford evaluate`; the evaluation that a run
-    ends with where none is named."""
+    """Prefix of a folder in each RUN/evaluations, which `adaafford evaluate` made; default: the final evaluation of
+    each run."""
     out: Path | None = None
     """A folder for comparison.md, comparison.png, comparison.csv and comparison.json."""
 

@@ -1,4 +1,4 @@
-"""`adaafford curve`: how much of what is hidden trainings find out from stored tries; needs neither Ray nor SAPIEN."""
+"""`adaafford curve`: how much critics know about hidden facts after some interactions; needs neither Ray nor SAPIEN."""
 
 import json
 from dataclasses import dataclass
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CurveCommand:
-    """Judge trainings on stored rollouts of objects that they have not seen, after some tries, and draw the curve."""
+    """Evaluate trainings on stored rollouts of unseen objects by number of interactions, and draw the curve."""
 
     store: str
     """Folder or s3:// URL of the store; it is only read."""
     runs: tuple[str, ...]
-    """NAME=RUN ...: the --out of `train alternate`, aap or aip. Runs of one name are seeds of one training. One that
-    left no oracle is held against the oracle of the run in the same place of another name."""
+    """NAME=RUN ...: the --out of `train alternate`, aap or aip. Runs with the same name are seeds of one training. A
+    run without an oracle is compared with the oracle of the run at the same position of another name."""
     out: Path | None = None
     """A folder for curve.md, curve.csv, curve.png and curve.json."""
     tries: tuple[int, ...] = (0, 1, 2, 4)
-    """Numbers of tries."""
+    """Numbers of interactions."""
     draws: int = 4
-    """How often tries and questions are drawn from each rollout."""
+    """How often contexts and queries are drawn from each rollout."""
     seed: int = 0
     """Of the draws."""
     threads: int | None = None

@@ -14,7 +14,7 @@ from shared.policies.methods import method_named
 
 @dataclass(frozen=True, slots=True)
 class EvaluateCommand:
-    """Try methods on objects that were not trained on, and write the table as Markdown, CSV and JSON.
+    """Evaluate methods on objects that were not trained on, and write the table as Markdown, CSV and JSON.
 
     The same command again goes on where it was stopped, and ends in the same table.
     """
@@ -25,8 +25,8 @@ class EvaluateCommand:
     policy: str | None = None
     """Instead of a run: a name of the policies that the package brings, a folder with policy.json, or a file there."""
     out: Path | None = None
-    """Folder for the trials and the table; where none is given, one that the settings name, below RUN/evaluations or,
-    without a run, below evaluations/ in the working folder."""
+    """Folder for the trials and the table; default: one named after the settings, in RUN/evaluations or, without a run,
+    in evaluations/ of the working folder."""
 
 
 def main(args: list[str]) -> int:

@@ -14,19 +14,19 @@ class ExportPolicyCommand:
     """Write a policy as weights.safetensors (half precision), policy.json and README.md (its model card)."""
 
     run: Annotated[Path, tyro.conf.Positional]
-    """Folder of a run, or --out of an `adaafford train`; the latter wants --store."""
+    """Folder of a run, or --out of an `adaafford train`; the latter needs --store."""
     out: Path
-    """Folder to write to; files of an earlier export are replaced, and nothing else may lie there."""
+    """Folder to write to; files of an earlier export are replaced; other files are not allowed."""
     policy: int | None = None
-    """Its version, of a run; the last where none is named."""
+    """Version of a run's policy; default: the last."""
     store: str | None = None
-    """Folder or s3:// URL of the store that was trained on, of a training."""
+    """For a training: folder or s3:// URL of its store."""
     results: Path | None = None
-    """A table that a training's card is to show, such as curve.md of `adaafford curve`; a run has its own."""
+    """For a training: a table for the model card, such as curve.md of `adaafford curve`; a run has its own."""
     origin: str = "objects of a user's store"
-    """What the card says of a training's objects."""
+    """For a training: the card's text about its objects."""
     licence: str = "MIT"
-    """What the card says; weights that were trained on others' objects may be bound by those objects' terms."""
+    """The licence in the card; the terms of the training objects may also apply to the weights."""
 
 
 def main(args: list[str]) -> int:

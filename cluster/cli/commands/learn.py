@@ -1,4 +1,4 @@
-"""`adaafford learn`: the learner as a process of its own, beside collection; needs neither Ray nor SAPIEN."""
+"""`adaafford learn`: the learner as a separate process beside a collection; needs neither Ray nor SAPIEN."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ class LearnCommand(LearnerCommand):
     """
 
     follow: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Wait for rollouts, also for the store itself, and publish a policy after each round."""
+    """Wait for the store and for rollouts, and publish a policy after each round."""
     first_rollouts: int = 100
     """With --follow: rollouts that the first round waits for."""
     more_rollouts: int = 30
     """With --follow: new rollouts that each further round waits for."""
     poll_s: float = 5.0
-    """With --follow: seconds between two looks into the store."""
+    """With --follow: seconds between two checks of the store."""
 
 
 def main(args: list[str]) -> int:

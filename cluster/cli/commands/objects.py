@@ -1,4 +1,4 @@
-"""`adaafford objects`: make objects, import and export them, check them, look at them, decompose them."""
+"""`adaafford objects`: generate, import, export, check, draw and decompose objects."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,11 +23,11 @@ class GenerateCommand:
     """Make built-in procedural objects in PartNet-Mobility's layout."""
 
     out: Annotated[Path, tyro.conf.Positional]
-    """Folder of the objects; what is there already is kept."""
+    """Folder of the objects; existing ones are kept."""
     per_category: Annotated[int, Field(ge=1)] = 4
     """Objects of each category."""
     categories: tuple[str, ...] = ()
-    """Only these; "train" and "test" stand for the paper's ten and five. All where none is named."""
+    """Only these; "train" and "test" stand for the paper's ten and five. Default: all."""
     seed: int = 1
     """Everything random derives from it."""
 
@@ -83,30 +83,30 @@ class ExportCommand:
 
 @dataclass(frozen=True, slots=True)
 class CheckCommand:
-    """Say of each object in one line whether it can be used, or why not; the exit code is 2 if none can."""
+    """Print one line for each object: usable, or the reason why not; the exit code is 2 if none is usable."""
 
     path: Annotated[Path, tyro.conf.Positional]
     """A folder of objects, or one object's folder."""
     task: str | None = None
-    """Say as well which objects suit this task: a name, or a TOML file."""
+    """Also check which objects suit this task: a name, or a TOML file."""
     object_list: Path | None = None
     """Only the objects of this list, `<id> <category>` a line, such as Where2Act publishes."""
     categories: tuple[str, ...] = ()
     """Only objects of these; "train" and "test" stand for the paper's ten and five."""
     settle: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Simulate as well whether usable objects come to rest, since a rollout begins with that; about a second each."""
+    """Also simulate whether usable objects come to rest, as at the start of a rollout; about a second each."""
 
 
 @dataclass(frozen=True, slots=True)
 class PreviewCommand:
-    """Draw a contact sheet: the body grey, every movable part in a colour of its own."""
+    """Draw a contact sheet: the body grey, every movable part in another colour."""
 
     path: Annotated[Path, tyro.conf.Positional]
     """A folder of objects, or one object's folder."""
     out: Annotated[Path, tyro.conf.Positional]
     """The picture, a PNG."""
     most: int = 100
-    """Objects drawn, at the most."""
+    """The most objects to draw."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class FilmCommand:
     out: Annotated[Path, tyro.conf.Positional]
     """The picture, a PNG."""
     primitives: tuple[str, ...] = ()
-    """Only these; none named: all there are."""
+    """Only these primitives; default: all."""
     gripper: str = PANDA
     """The hand."""
     seed: int = 1

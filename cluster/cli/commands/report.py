@@ -1,4 +1,4 @@
-"""`adaafford report`: a run's results as a page, and on the terminal again."""
+"""`adaafford report`: the results of a run as a page and on the terminal."""
 
 import sys
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from cluster.config.flags import parse_flags
 
 @dataclass(frozen=True, slots=True)
 class ReportCommand:
-    """Make RUN/report.html, summary.json and affordance.png of a finished run anew, and print its table."""
+    """Write RUN/report.html, summary.json and affordance.png of a finished run again, and print its table."""
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run."""
     experiments: bool = True
-    """Try a test object under other hidden facts in the simulator, and show what the affordance makes of it."""
+    """Simulate a test object with other hidden facts, and show the affordance for each of them."""
 
 
 def main(args: list[str]) -> int:

@@ -1,4 +1,4 @@
-"""`adaafford resume`: go on with a run that was stopped, however it was stopped."""
+"""`adaafford resume`: continue a run that was stopped in any way."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,20 +12,20 @@ from shared.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class ResumeCommand:
-    """Go on with a run; its configuration is taken from its folder."""
+    """Continue a run with the configuration in its folder."""
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of the run."""
     workers: int | None = None
-    """Instead of the number of workers that the run was begun with."""
+    """Another number of workers than at the start of the run."""
     objects: Path | None = None
-    """Where the folder of objects that the run was begun with lies now; the run remembers it."""
+    """The new path of the run's folder of objects; the run records it."""
     start_from: str | None = None
-    """Where the policy that the run is to start from lies now; the run remembers it."""
+    """The new path of the policy that the run starts from; the run records it."""
 
 
 def main(args: list[str]) -> int:
-    """Go on with a campaign."""
+    """Continue a campaign."""
     command = parse_flags(ResumeCommand, args, "resume")
     from cluster.campaign.campaign import Campaign
     from cluster.config.campaign_config import CampaignConfig

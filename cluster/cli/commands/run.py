@@ -14,24 +14,24 @@ from shared.policies.methods import method_named
 
 @dataclass(frozen=True, slots=True)
 class RunCommand:
-    """Collect at random, train, collect with what was learnt, fine-tune, and evaluate on unseen objects.
+    """Collect random interactions, train, collect proposed interactions, fine-tune, and evaluate on unseen objects.
 
     The same command again goes on where it was stopped.
     """
 
     settings: Annotated[CampaignConfig, tyro.conf.arg(name="")]
     out: Path | None = None
-    """Folder of the run: new, empty, or of the same run. Only a dry run needs none."""
+    """Folder of the run: new, empty, or of the same run. A dry run needs none."""
     preset: str = "smoke"
-    """A set of settings that the package brings: smoke, laptop or paper."""
+    """A set of settings: smoke, laptop or paper."""
     config: Path | None = None
-    """A TOML file of settings, laid over the preset; flags are laid over both."""
+    """A TOML file of settings, which replace those of the preset; flags replace both."""
     dry_run: bool = False
-    """Only say what it will cost: interactions, core-hours and disk, by stage. Nothing is simulated or written."""
+    """Only print the cost by stage: interactions, core-hours and disk. Nothing is simulated or written."""
 
 
 def main(args: list[str]) -> int:
-    """Run, or go on with, a campaign."""
+    """Run or continue a campaign."""
     early = early_flags(args, "preset", "config")
     preset, config = early["preset"] or "smoke", Path(early["config"]) if early["config"] else None
     defaults = RunCommand(layered(CampaignConfig, preset, config), None, preset, config)

@@ -1,4 +1,4 @@
-"""`adaafford status`: how a run, a store or a learner stands, live."""
+"""`adaafford status`: the live status of a run, a store or a learner."""
 
 import json
 import sys
@@ -23,7 +23,7 @@ MOST_METRICS = 6
 
 @dataclass(frozen=True, slots=True)
 class StatusCommand:
-    """Show how something stands, until Ctrl-C on a terminal, once elsewhere; asks nobody, and disturbs nobody."""
+    """Show the status: on a terminal until Ctrl-C, otherwise once; only reads files, and disturbs no process."""
 
     where: Annotated[str, tyro.conf.Positional]
     """Folder of a run, of a learner or of a store, or s3:// URL of a store."""
@@ -32,7 +32,7 @@ class StatusCommand:
     once: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the table once, also on a terminal."""
     every: float = 2.0
-    """Seconds between two looks."""
+    """Seconds between two updates."""
 
 
 def main(args: list[str]) -> int:

@@ -1,4 +1,4 @@
-"""`adaafford store`: look into a store, or at the place where one shall be."""
+"""`adaafford store`: inspect, verify and replay a store, or test a storage backend."""
 
 import faulthandler
 import json
@@ -31,7 +31,7 @@ MOST_SHOWN = 20
 
 @dataclass(frozen=True, slots=True)
 class InfoCommand:
-    """Say what a store holds."""
+    """Print the contents of a store."""
 
     store: Annotated[str, tyro.conf.Positional]
     """Folder or s3:// URL of the store."""
@@ -41,23 +41,23 @@ class InfoCommand:
 
 @dataclass(frozen=True, slots=True)
 class VerifyCommand:
-    """Recompute everything that a store claims; the exit code is 1 if anything is wrong."""
+    """Recompute every checksum and rule of a store; the exit code is 1 if anything is wrong."""
 
     store: Annotated[str, tyro.conf.Positional]
     """Folder or s3:// URL of the store."""
     resimulate: int = 0
-    """Also execute this many random rows again, and say how far they come out otherwise; needs --objects."""
+    """Also execute this many random rows again, and print how much the results differ; needs --objects."""
     objects: Path | None = None
-    """Folder of the objects that the store was made with."""
+    """Folder of the store's objects."""
     seed: int = 1
-    """Of the choice of rows."""
+    """Seed for the choice of rows."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object instead of text."""
 
 
 @dataclass(frozen=True, slots=True)
 class DigestCommand:
-    """Print the content digest as the last line: the same for the same interactions, whoever made them, and when."""
+    """Print the content digest as the last line; it depends on the interactions, not on workers or times."""
 
     store: Annotated[str, tyro.conf.Positional]
     """Folder or s3:// URL of the store."""
@@ -65,7 +65,7 @@ class DigestCommand:
 
 @dataclass(frozen=True, slots=True)
 class ReplayCommand:
-    """Execute one job in this process, without Ray, to see why it fails; it is committed if it does not.
+    """Execute one job in this process, without Ray, to see why it fails; if it succeeds, it is committed.
 
     With --rollout, that rollout alone is executed, whatever the store says of it, and nothing is committed.
     """
@@ -75,23 +75,23 @@ class ReplayCommand:
     shard: Annotated[str, tyro.conf.Positional]
     """The shard that the job makes, such as random-v0-00000000-00000002."""
     objects: Path
-    """Folder of the objects that the store was made with."""
+    """Folder of the store's objects."""
     rollout: int | None = None
     """Number of one rollout of the job."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckPlaceCommand:
-    """Check that of several concurrent writers of one new file exactly one wins, which commits rely on.
+    """Check that exactly one of several concurrent writers of a new file succeeds, which commits rely on.
 
-    It needs no store and leaves nothing behind, so any server of buckets can be tried. Whatever creates a store in a
+    It needs no store and leaves nothing behind, so any bucket server can be tested. A command that creates a store in a
     bucket does the same in 3 rounds of 8 writers.
     """
 
     place: Annotated[str, tyro.conf.Positional]
     """A folder, or s3://BUCKET/PREFIX."""
     rounds: int = 100
-    """Files that are written."""
+    """Number of files."""
     writers: int = 16
     """Concurrent writers of each file."""
 
@@ -229,7 +229,7 @@ def _replay(command: ReplayCommand) -> int:
 
 
 def _announce(rollout: int | None) -> None:
-    """Say which rollout begins, for whoever sees it end in a crash."""
+    """Print which rollout begins, in case it crashes."""
     if rollout is not None:
         print(f"rollout {rollout}", file=sys.stderr, flush=True)
 
@@ -252,7 +252,7 @@ def _check_place(command: CheckPlaceCommand) -> int:
             raise UsageError(f"--{name} {given}: allowed: {least} to {most}")
     place = backend_of(command.place)
     if not place.is_there():
-        raise UsageError(f"{command.place}: there is no such folder; make it, or name another")
+        raise UsageError(f"{command.place}: there is no such folder; create it, or name another")
     try:
         check_place(place, command.writers, command.rounds)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""`adaafford train`: the learner alone, from a store; needs neither Ray nor SAPIEN."""
+"""`adaafford train`: training from a store; needs neither Ray nor SAPIEN."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ batch among N processes. `adaafford train prior --help` lists all settings."""
 
 @dataclass(frozen=True, slots=True)
 class LearnerCommand:
-    """What all commands that train are told."""
+    """Flags of all commands that train."""
 
     settings: Annotated[LearnerConfig, tyro.conf.arg(name="")]
     store: str
@@ -41,9 +41,9 @@ class LearnerCommand:
     train_objects: Path | None = None
     """A text file with the ids of the objects to learn from, one a line."""
     validation_objects: Path | None = None
-    """The same, of the objects to judge by; without both, one object in five is kept for that."""
+    """The same for validation; without both files, one object in five is used for validation."""
     config: Path | None = None
-    """A TOML file of settings; flags are laid over it."""
+    """A TOML file of settings; flags replace them."""
 
     def job(self, stage: "StageName" = "prior", init: Path | None = None) -> "StageJob":
         """What is trained on."""
@@ -56,10 +56,10 @@ class LearnerCommand:
 
 @dataclass(frozen=True, slots=True)
 class TrainCommand(LearnerCommand):
-    """Train networks from a finished store. The same command again goes on where it was stopped."""
+    """Train networks from a finished store. Give the same command again to continue."""
 
     init: Path | None = None
-    """The --out of the stage before, to start from."""
+    """The --out of the previous stage, whose networks are the start."""
 
 
 Command = TypeVar("Command", bound=LearnerCommand)

@@ -158,7 +158,7 @@ def _compact(command: CompactCommand) -> int:
     if command.json:
         print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
         return 0
-    print(f"{done.before} shards became {done.after}; {len(done.set_aside)} small ones lie in {store.where}/aside")
+    print(f"{done.before} shards became {done.after}; {len(done.set_aside)} small ones are in {store.where}/aside")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""A proposer that needs no policy: it tries points far from the hinge, where a force has the longest lever."""
+"""A proposer that needs no policy: it chooses points far from the hinge, where a force has the longest lever."""
 
 from collections.abc import Sequence
 

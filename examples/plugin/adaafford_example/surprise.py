@@ -1,4 +1,4 @@
-"""A baseline with a network of one weight: how far the surprise of the tries shifts what Where2Act says everywhere.
+"""A baseline with one weight: how much the surprise of the interactions shifts Where2Act's scores everywhere.
 
 This file is all of it: network, settings, training, critics, and the method that the table lists.
 """
@@ -40,14 +40,14 @@ class SurpriseConfig(TrainingConfig):
 
 
 class Surprise(nn.Module):
-    """s|tries = sigmoid(logit(s) + w * mean(r - s of the tries))."""
+    """s given I = sigmoid(logit(s) + w * mean(r - s of the interactions))."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(()))
 
     def logits(self, scores: Tensor, successes: Tensor, expected: Tensor) -> Tensor:
-        """Shifted logits of Where2Act's scores, [..., n], after tries [..., K] and what Where2Act said of them."""
+        """Shifted logits of Where2Act's scores, [..., n], after interactions [..., K] with Where2Act's scores."""
         surprise = (successes - expected).mean(dim=-1, keepdim=True) if successes.shape[-1] else scores.new_zeros(1)
         return torch.logit(scores, eps=1e-4) + self.weight * surprise
 
@@ -56,7 +56,7 @@ class Surprise(nn.Module):
 
 
 class SurpriseStage:
-    """Random rows of a rollout are the tries; all other rows of it are predicted."""
+    """Random rows of a rollout are the context; all other rows of it are predicted."""
 
     name = NAME
 
@@ -147,7 +147,7 @@ class SurpriseCritic:
 
 BASELINE = Baseline(Surprise, SurpriseCritic, training=f"{__name__}:TRAINING")
 METHOD = Method("furthest", NAME)
-"""The tries of this package's own proposer, read by this baseline."""
+"""This package's own proposer, with this baseline as the critic."""
 TRAINING = BaselineTraining(
     SurpriseConfig,
     _train,

@@ -1,1 +1,1 @@
-"""Where a store lies: a folder or a bucket, behind one interface."""
+"""Storage backends of a store: a folder or a bucket, behind one interface."""

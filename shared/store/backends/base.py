@@ -1,8 +1,8 @@
-"""Where a store lies: a folder of a disk, or a prefix of a bucket; files are named by key, such as "shards/x/y".
+"""Storage backends: a folder of a disk, or a prefix of a bucket; files are named by key, such as "shards/x/y".
 
 backend = backend_of("s3://bucket/prefix")   # or a folder
-place.read("store.json", limit=1 << 20)
-backend.publish(Transaction(...))           # a folder of files: wholly or not at all, and once
+backend.read("store.json", limit=1 << 20)
+backend.publish(Transaction(...))            # a folder of files: all or nothing, and once
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,16 +18,16 @@ URL_SCHEME = "s3://"
 
 @dataclass(frozen=True, slots=True)
 class Transaction:
-    """A folder that comes to be there as a whole, by one file of it, the mark, that is written last.
+    """The publication of a folder, which becomes complete when its last file, the mark, is written.
 
     Attributes:
-        folder: its key.
-        files: by path within it, all but the mark.
+        folder: key of the folder.
+        files: all files but the mark, by path within the folder.
         mark: path of the mark within the folder.
-        describe: the mark's content, for the files as they lie there: those given, or, where another writer was faster
-            with some of them in a place that has no rename, that writer's. Raises StoreError where these will not do.
-        check: raises StoreError if the folder may not be published after all.
-        lock: writers of the same name take turns for the last step, where a place has locks.
+        describe: makes the content of the mark from the files that are stored. These are `files`, or, in a backend
+            without rename, files that another writer stored first. Raises StoreError if they cannot be used.
+        check: raises StoreError if the folder may not be published.
+        lock: writers with the same lock take turns for the last step, in a backend with locks.
     """
 
     folder: str
@@ -39,94 +39,94 @@ class Transaction:
 
 
 class StorageBackend(Protocol):
-    """Files by key.
+    """Reads and writes files by key.
 
-    No data that are there are ever overwritten, and nothing is deleted but remnants of dead writers; what tells of the
-    moment (`replace`, `remove`) lies in a folder of its own.
+    Data are never overwritten, and only leftovers of dead writers are deleted. Files about the present state
+    (`replace`, `remove`), which are no data, have a separate folder.
     """
 
     where: str
-    """What people call it: a folder or a URL."""
+    """Its name in messages: a folder or a URL."""
     writes_in_place: bool
-    """Whether a folder without its mark may be one that a live writer is about to finish."""
+    """Whether a live writer may still complete a folder that has no mark."""
 
     def is_there(self) -> bool:
-        """Whether the place itself is, as far as that can be told."""
+        """Whether the folder or the bucket exists, as far as this is known."""
         ...
 
     def read(self, key: str, limit: int) -> bytes:
         """A file of at most `limit` bytes.
 
         Raises:
-            MissingError: there is none.
-            StoreError: it is larger, or no regular file.
-            UnreadableError: the disk, the network or the server refuses; so may all that follows here.
+            MissingError: it does not exist.
+            StoreError: it is larger, or not a regular file.
+            UnreadableError: the disk, the network or the server refuses; all other methods may raise this, too.
         """
         ...
 
     def read_all(self, wanted: Sequence[tuple[str, int]]) -> Iterator[bytes]:
-        """Several files, each given as key and limit, in order; at once where that is faster. Raises as `read` does."""
+        """Several files, given as (key, limit), in this order, concurrently if that is faster; raises like `read`."""
         ...
 
     def exists(self, key: str) -> bool:
-        """Whether there is such a file."""
+        """Whether the file exists."""
         ...
 
     def exist(self, keys: Sequence[str]) -> Iterator[bool]:
-        """Whether there are such files, in order; at once where that is faster."""
+        """Whether the files exist, in the order of `keys`, concurrently if that is faster."""
         ...
 
     def names(self, folder: str) -> list[str]:
-        """What lies directly in a folder ("" is the store itself), in order; nothing if the folder is not there."""
+        """Sorted names of the entries of a folder ("" is the store itself); empty if the folder does not exist."""
         ...
 
     def names_from(self, folder: str, first: str) -> Iterator[str]:
-        """What lies directly in a folder and is not before `first`, in order, asked for as it is consumed."""
+        """Sorted names of the entries of a folder from `first` on, listed lazily."""
         ...
 
     def leaves(self, folder: str) -> list[str]:
-        """Keys of everything below a folder that holds nothing itself, in order."""
+        """Sorted keys of all files and empty folders below a folder."""
         ...
 
     def create(self, key: str, data: bytes) -> bool:
-        """Put a file there, wholly or not at all, unless there is one; returns whether this call made it."""
+        """Write a file atomically unless it exists; returns whether this call created it."""
         ...
 
     def replace(self, key: str, data: bytes) -> None:
-        """Put a file there, wholly or not at all, over what was there; for what tells of the moment, never for data.
+        """Write a file atomically, also over an existing one; for files about the present state, never for data.
 
         Raises:
-            StoreError: the place is out of reach.
+            StoreError: the backend cannot be reached.
             OSError: the file cannot be written.
         """
         ...
 
     def remove(self, key: str) -> None:
-        """Remove such a file; it is no error if there is none."""
+        """Remove a file that `replace` wrote, if it exists."""
         ...
 
     def publish(self, transaction: Transaction) -> bool:
-        """Put a folder there unless it is there, with its mark; returns whether this call did it.
+        """Publish a folder with its mark unless it is complete already; returns whether this call did it.
 
         Raises:
-            StoreError: it may not be published, or the place is out of reach.
+            StoreError: the folder may not be published, or the backend cannot be reached.
         """
         ...
 
     def move(self, key: str, new: str) -> None:
-        """Give a file or folder another key, which nothing has; for what is broken. Called again, it goes on."""
+        """Move a damaged file or folder to an unused key; after an interruption, a second call completes the move."""
         ...
 
     def sweep(self, folders: Sequence[str]) -> int:
-        """Remove what dead writers left unfinished directly in some folders; returns how many."""
+        """Remove unfinished files of dead writers in some folders; returns how many."""
         ...
 
     def only_one(self, name: str, *, alone: bool = False) -> AbstractContextManager[Any]:
-        """Hold the place against other holders of the same name.
+        """Hold a lock.
 
         Args:
-            name: what is held.
-            alone: whether there must be no other at all; a place without locks takes several holders otherwise.
+            name: of the lock.
+            alone: whether no other process may hold it; otherwise a backend without locks allows several holders.
 
         Raises:
             UsageError: another process holds it; the message names that process.
@@ -136,7 +136,7 @@ class StorageBackend(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Folder:
-    """A folder of a place; as text, what messages call it."""
+    """A folder of a storage backend; as text, its name in messages."""
 
     backend: StorageBackend
     key: str
@@ -150,7 +150,7 @@ class Folder:
         return f"{self.backend.where}/{self.key}"
 
     def has(self, name: str) -> bool:
-        """Whether it holds a file."""
+        """Whether it has a file."""
         return self.backend.exists(f"{self.key}/{name}")
 
     def read(self, name: str, limit: int) -> bytes:
@@ -167,25 +167,25 @@ class Folder:
 
 
 def is_url(where: str | Path) -> bool:
-    """Whether this names an object store, or tries to, and not a folder."""
+    """Whether this is a URL, allowed or not, and not a folder."""
     return isinstance(where, str) and "://" in where
 
 
 def backend_of(where: str | Path) -> StorageBackend:
-    """The place that a folder's path or an "s3://bucket/prefix" names.
+    """The storage backend for the path of a folder or for "s3://bucket/prefix".
 
     Raises:
-        UsageError: a URL that is not allowed, or credentials that are missing.
+        UsageError: the URL is not allowed, or credentials are missing.
     """
     if is_url(where):
-        from shared.store.backends.s3 import BucketPlace
+        from shared.store.backends.s3 import S3Backend
 
-        return BucketPlace.of(str(where))
+        return S3Backend.of(str(where))
     if isinstance(where, Path) and where.parts[:1] == ("s3:",):
         raise UsageError(f"{where}: a path cannot hold the two slashes of a URL; give s3://BUCKET/PREFIX as text")
-    from shared.store.backends.local import DiskPlace
+    from shared.store.backends.local import LocalBackend
 
-    return DiskPlace(Path(where))
+    return LocalBackend(Path(where))
 
 
 def folder_beside(where: str, suffix: str) -> Path:

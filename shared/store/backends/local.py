@@ -1,4 +1,4 @@
-"""A store in a folder of a disk: written beside, forced to the disk, renamed into place."""
+"""The storage backend for a folder of a disk: files are written under a temporary name, synced and renamed."""
 
 import errno
 import os
@@ -28,7 +28,7 @@ _LOCK_WAIT_S = 60.0
 """Locks are held for milliseconds; one that lasts longer means a hung disk."""
 
 
-class DiskPlace:
+class LocalBackend:
     """See `shared.store.backends.base.StorageBackend`."""
 
     writes_in_place = False
@@ -42,10 +42,10 @@ class DiskPlace:
         return stat.S_ISDIR(_mode(self.root))
 
     def read(self, key: str, limit: int) -> bytes:
-        """See `StorageBackend.read`; what is reached through a symbolic link below the first level is refused."""
+        """See `StorageBackend.read`; symbolic links below the first level are refused."""
         parts = PurePosixPath(key).parts
         for depth in range(2, len(parts)):
-            # A link could lead anywhere. The first level may be one: a disk of its own for the shards, say.
+            # A link could lead anywhere. The first level may be one, for example to a separate disk for the shards.
             if stat.S_ISLNK(_mode(self.root.joinpath(*parts[:depth]), follow=False)):
                 raise StoreError(f"{self._at(key)}: reached through a symbolic link; replace it by the folder itself")
         return read_bounded(self._at(key), limit)
@@ -117,7 +117,7 @@ class DiskPlace:
             _write_files(temporary, transaction.files, transaction.mark, transaction.describe(transaction.files))
             return self._move_into_place(temporary, final, transaction)
         finally:
-            # After success this name is gone; after a lost race, or an error, what lies here is of no use.
+            # After a lost race or an error the temporary folder is still there.
             remove_tree(temporary)
 
     def move(self, key: str, new: str) -> None:

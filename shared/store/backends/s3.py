@@ -44,7 +44,7 @@ _CREDENTIALS = (
 Answer = TypeVar("Answer")
 
 
-class BucketPlace:
+class S3Backend:
     """See `shared.store.backends.base.StorageBackend`."""
 
     writes_in_place = True
@@ -55,8 +55,8 @@ class BucketPlace:
         self._pool: ThreadPoolExecutor | None = None
 
     @classmethod
-    def of(cls, url: str) -> "BucketPlace":
-        """The place of a URL; credentials and endpoint are the environment's AWS_* variables.
+    def of(cls, url: str) -> "S3Backend":
+        """The storage backend of a URL; credentials and endpoint are the environment's AWS_* variables.
 
         Raises:
             UsageError: the URL is not allowed, or there are no credentials.
@@ -201,7 +201,7 @@ class BucketPlace:
             return request()
         except (FileNotFoundError, GenericError) as error:
             if "NoSuchBucket" in str(error):
-                raise UnreadableError(f"{self.where}: there is no such bucket; make it, or name another") from None
+                raise UnreadableError(f"{self.where}: there is no such bucket; create it, or name another") from None
             if not isinstance(error, FileNotFoundError):
                 raise self._out_of_reach(key, error) from None
             if not missing_is_error:

@@ -60,7 +60,7 @@ def _walk(data: bytes, column: Any, rows: int, most: int, most_pages: int) -> tu
         start = column.dictionary_page_offset
     place, stop = start, start + column.total_compressed_size
     if not 0 < start <= stop <= len(data):
-        raise ValueError(f"column {name} lies outside of the file")
+        raise ValueError(f"column {name} is outside of the file")
     size = values = pages = 0
     while place < stop:
         header, place = _struct(data, place, stop)
@@ -71,7 +71,7 @@ def _walk(data: bytes, column: Any, rows: int, most: int, most_pages: int) -> tu
         count, encoding = about.get(1), about.get(4 if kind_of_page == _DATA_V2 else 2)
         size, pages, place = size + max(unpacked, 0), pages + 1, place + packed
         if type(count) is not int or min(count, unpacked, packed) < 0 or place > stop:
-            raise ValueError(f"column {name} has a page that lies outside of it")
+            raise ValueError(f"column {name} has a page outside of it")
         if size > most or pages > most_pages:
             raise ValueError(f"column {name} unpacks to more than {most} bytes or {most_pages} pages")
         if kind_of_page == _DICTIONARY:

@@ -184,7 +184,7 @@ def _open(data: bytes, texts: Sequence[str]) -> Any:
 
 
 def _check_columns(there: Any, columns: Columns, source: str) -> None:
-    """See that a file has the columns that it must have, and none twice.
+    """Check that a file has the columns that it must have, and none twice.
 
     Raises:
         StoreError: a column is missing that has no default, or one is of another type.
