@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import shared.extras as extras_module
 from cluster.cli.main import run
 from collector.objects import meshes
 from collector.objects.articulation import ArticulatedObject, Mesh
@@ -19,6 +20,7 @@ from collector.objects.importing.placement import Placement
 from collector.objects.readers import read_object
 from collector.objects.writing import obj_text
 from shared.errors import ObjectError, UsageError
+from shared.extras import MODULES
 
 EXACT = ("package://package", "model://package", "../meshes")
 """Names that say where the mesh is; the others only say how its path ends."""
@@ -365,3 +367,23 @@ def test_placements_are_pure(cabinet: Path, tmp_path: Path) -> None:
     assert first.after.ref == second.after.ref
     turned = imported(cabinet, tmp_path / "c", replace(settings, placement=Placement(front="-y")))
     assert turned.after.ref != first.after.ref
+
+
+@pytest.mark.parametrize(
+    ("file", "package"), [("door.dae", "pycollada"), ("door.glb", "trimesh"), ("room.xml", "mujoco")]
+)
+def test_a_package_that_is_missing_is_named_with_its_extra(
+    file: str,
+    package: str,
+    cabinet: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found, hidden = extras_module.find_spec, MODULES.get(package, package)
+    monkeypatch.setattr(extras_module, "find_spec", lambda name: None if name == hidden else found(name))
+    (cabinet.parent / "meshes" / file).write_bytes(b"")
+    cabinet.write_text(urdf(f"meshes/{file}"))
+    source = cabinet.parent / "meshes" / file if file.endswith(".xml") else cabinet
+    assert run(["objects", "import", str(source), "--out", str(tmp_path / "objects")]) == 2
+    assert f"needs {package}, not installed here: pip install 'adaafford[import]'" in capsys.readouterr().err

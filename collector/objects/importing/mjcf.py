@@ -200,7 +200,7 @@ class _Meshes:
             scale = np.array(asset.scale, dtype=np.float64)
             if np.abs(scale).min() < 1e-9:
                 raise ObjectError(f"mesh {short(asset.name)}: a scale other than 0 is needed along each axis")
-            reference = np.asarray(np.linalg.inv(_pose(np.array(asset.refpos), np.array(asset.refquat))), np.float64)
+            reference = np.linalg.inv(_pose(np.array(asset.refpos), np.array(asset.refquat))).astype(np.float64)
             found[asset.name] = meshes.placed(mesh, reference, scale)
             asset.file = ""
             asset.uservert, asset.userface = _UNIT_SIMPLEX.ravel().tolist(), _SIMPLEX_FACES
