@@ -183,9 +183,11 @@ def like_for_like_note(base_rate: float | None, share: float | None) -> str:
         base_rate: of success in the published mix.
         share: of a cloud's points, from which actions by share were drawn; None: there were none.
     """
+    always_yes = None if base_rate is None else 2 * base_rate / (1 + base_rate)
     note = (
         "Published mix: the same questions, weighted as the paper's test rollouts were topped up by label, of which "
-        f"{percent(base_rate)}% succeed; shifted: with logits moved by the change of the base rate."
+        f"{percent(base_rate)}% succeed (a critic that always says yes has an F-score of {percent(always_yes)}); "
+        "shifted: with logits moved by the change of the base rate."
     )
     if share is not None:
         note += (
