@@ -31,18 +31,19 @@ LEROBOT = (
 
 def install(python: Path, *args: str) -> None:
     """Install packages, or skip the test where there is no index of them."""
-    done = subprocess.run([python, "-m", "pip", "install", "--quiet", *args], capture_output=True, text=True)
+    done = subprocess.run(
+        [python, "-m", "pip", "install", "--quiet", "--no-compile", *args], capture_output=True, text=True
+    )
     if done.returncode:
         pytest.skip(f"packages cannot be installed here: {done.stderr.strip().splitlines()[-1]}")
 
 
-def environment(folder: Path, *, with_ours: bool) -> Path:
-    """The Python of a new environment."""
+def environment(folder: Path) -> Path:
+    """The Python of a new environment that also finds the packages of ours, which need not be installed again."""
     venv.create(folder, with_pip=True)
-    if with_ours:
-        version = f"python{sys.version_info.major}.{sys.version_info.minor}"
-        paths = [path for path in sys.path if path.endswith("site-packages")] or [sysconfig.get_path("purelib")]
-        (folder / f"lib/{version}/site-packages/zz_ours.pth").write_text("\n".join(paths) + "\n")
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    paths = [path for path in sys.path if path.endswith("site-packages")] or [sysconfig.get_path("purelib")]
+    (folder / f"lib/{version}/site-packages/zz_ours.pth").write_text("\n".join(paths) + "\n")
     return folder / "bin/python"
 
 
@@ -69,7 +70,7 @@ def check(folder: Path, python: Path, readers: dict[str, str]) -> None:
 
 @pytest.mark.slow
 def test_datasets_duckdb_polars_webdataset_and_minari_read_exports(tmp_path: Path) -> None:
-    python = environment(tmp_path / "venv", with_ours=False)
+    python = environment(tmp_path / "venv")
     install(python, *QUICK)
     formats = {"datasets": "hf", "duckdb": "hf", "polars": "hf", "webdataset": "webdataset", "minari": "minari"}
     check(tmp_path, python, formats)
@@ -77,7 +78,7 @@ def test_datasets_duckdb_polars_webdataset_and_minari_read_exports(tmp_path: Pat
 
 @pytest.mark.slow
 def test_lerobot_reads_its_export(tmp_path: Path) -> None:
-    python = environment(tmp_path / "venv", with_ours=True)
+    python = environment(tmp_path / "venv")
     for args in (["--no-deps", *LEROBOT[0]], LEROBOT[1]):
         install(python, *args)
     check(tmp_path, python, {"lerobot": "lerobot"})
@@ -85,7 +86,7 @@ def test_lerobot_reads_its_export(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_an_export_is_put_on_a_hub_with_the_token_of_the_environment_alone(tmp_path: Path) -> None:
-    python = environment(tmp_path / "venv", with_ours=True)
+    python = environment(tmp_path / "venv")
     install(python, "huggingface_hub")
     store, out = make(tmp_path / "store"), tmp_path / "out"
     args = [
