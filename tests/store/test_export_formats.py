@@ -316,6 +316,18 @@ def test_an_export_that_was_stopped_goes_on(name: str, store: Store, tmp_path: P
     assert len(written) < before - 5, "pieces that were finished are not written again"
 
 
+def test_an_export_that_has_all_but_its_name_is_not_written_again(store: Store, tmp_path: Path) -> None:
+    with disk_faults(Fault("ENOSPC", 0)) as steps:
+        export(store, tmp_path / "whole", SPLITS, format="hf")
+    last = max(number for number, step in enumerate(steps, 1) if step == "rename")
+    with disk_faults(Fault("ENOSPC", last)), pytest.raises(UsageError, match="No space left on device"):
+        export(store, tmp_path / "out", SPLITS, format="hf")
+    said = list[tuple[int, int]]()
+    export(store, tmp_path / "out", SPLITS, lambda *counts: said.append(counts), format="hf")
+    assert len(said) == len(store.parts()), "each shard was looked through, and none was written"
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
 def contents(out: Path) -> dict[str, bytes]:
     """All files; Zarr's metadata say nothing of time."""
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}

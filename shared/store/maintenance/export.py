@@ -113,8 +113,10 @@ def export(
             write_atomically(folder / "croissant.json", _json(croissant(content, chosen)))
             if deliver is not None:
                 deliver(folder)
-            remove_tree(folder / _NOTES)
+            # It names this machine. The other notes stay until the folder has its name: a kill here loses nothing.
+            (folder / _NOTES / DRIVER_LOCK).unlink()
             folder.rename(out)
+            remove_tree(out / _NOTES)
             sync_folder(out.parent)
     except OSError as error:
         why = os.strerror(error.errno) if error.errno else str(error)
