@@ -24,6 +24,7 @@ from shared.io.files import exclusive_lock
 from shared.plan import Job, Plan
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store, export
+from shared.store.maintenance.datacard import SplitFigures, size_category
 from shared.store.maintenance.formats import EXPORT_FORMATS, word
 from shared.store.maintenance.steps import Content
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
@@ -386,9 +387,7 @@ def test_the_card_is_for_programs_too_and_names_no_person_or_machine(
     assert not [each for each in ("somebody", str(tmp_path), str(store.path)) if each.encode() in everything]
 
 
-def test_the_size_of_a_card_is_that_of_the_steps(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from shared.store.maintenance.datacard import SplitFigures, size_category
-
+def test_the_size_of_a_card_is_that_of_the_steps() -> None:
     for steps, said in ((0, "n<1K"), (999, "n<1K"), (1000, "1K<n<10K"), (99_999, "10K<n<100K"), (10**6, "1M<n<10M")):
         figures = dataclasses.replace(SplitFigures.nothing(), interactions=steps)
         assert size_category([figures]) == said
