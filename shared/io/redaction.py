@@ -16,7 +16,13 @@ _USER_INFO = re.compile(
     r"|(?<![^\s'\"=(])[^\s/:@'\"=(]+:[^\s/@'\"]+@(?=[\w\[])"  # or of an address without a scheme.
 )
 _SIGNATURE = re.compile(r"(?i)\b(x-amz-(?:signature|credential|security-token))=[^&\s'\"]+")
-_SECRETS = ("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_CONTAINER_AUTHORIZATION_TOKEN", "RAY_AUTH_TOKEN")
+_SECRETS = (
+    "AWS_SECRET_ACCESS_KEY",
+    "AWS_SESSION_TOKEN",
+    "AWS_CONTAINER_AUTHORIZATION_TOKEN",
+    "RAY_AUTH_TOKEN",
+    "HF_TOKEN",
+)
 """Variables whose values never belong in a message, in whatever way they came into it."""
 _SHORTEST = 8
 """A secret that is shorter is as well part of a word."""

@@ -1,10 +1,12 @@
 """Formats of `store export`: each is read back without the code that wrote it, and compared with the records."""
 
 import dataclasses
+import importlib.util
 import io
 import itertools
 import json
 import socket
+import sys
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +24,7 @@ from shared.io.files import exclusive_lock
 from shared.plan import Job, Plan
 from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store, export
+from shared.store.maintenance.datacard import SplitFigures, size_category
 from shared.store.maintenance.formats import EXPORT_FORMATS, word
 from shared.store.maintenance.steps import Content
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
@@ -79,6 +82,7 @@ def columns_of(rollout: RolloutRecord, each: InteractionRecord) -> Row:
         "success": each.outcome.success,
         "motion": each.outcome.motion,
         "displacement": each.outcome.displacement,
+        "joint_positions": each.joint_positions,
     }
 
 
@@ -162,8 +166,8 @@ READERS: dict[str, Callable[[Path], Rows]] = {
     "webdataset": read_webdataset,
     "minari": read_minari,
 }
-LACKING = {"lerobot": ("action.point", "action.approach", "action.forward")}
-"""Columns that a format has in another form."""
+LACKING = {"lerobot": ("action.point", "action.approach", "action.forward", "joint_positions")}
+"""Columns that a format has in another form, or not at all."""
 
 
 def same(found: Any, wanted: Any) -> bool:
@@ -313,6 +317,18 @@ def test_an_export_that_was_stopped_goes_on(name: str, store: Store, tmp_path: P
     assert len(written) < before - 5, "pieces that were finished are not written again"
 
 
+def test_an_export_that_has_all_but_its_name_is_not_written_again(store: Store, tmp_path: Path) -> None:
+    with disk_faults(Fault("ENOSPC", 0)) as steps:
+        export(store, tmp_path / "whole", SPLITS, format="hf")
+    last = max(number for number, step in enumerate(steps, 1) if step == "rename")
+    with disk_faults(Fault("ENOSPC", last)), pytest.raises(UsageError, match="No space left on device"):
+        export(store, tmp_path / "out", SPLITS, format="hf")
+    said = list[tuple[int, int]]()
+    export(store, tmp_path / "out", SPLITS, lambda *counts: said.append(counts), format="hf")
+    assert len(said) == len(store.parts()), "each shard was looked through, and none was written"
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
 def contents(out: Path) -> dict[str, bytes]:
     """All files; Zarr's metadata say nothing of time."""
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
@@ -371,9 +387,7 @@ def test_the_card_is_for_programs_too_and_names_no_person_or_machine(
     assert not [each for each in ("somebody", str(tmp_path), str(store.path)) if each.encode() in everything]
 
 
-def test_the_size_of_a_card_is_that_of_the_steps(store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from shared.store.maintenance.datacard import SplitFigures, size_category
-
+def test_the_size_of_a_card_is_that_of_the_steps() -> None:
     for steps, said in ((0, "n<1K"), (999, "n<1K"), (1000, "1K<n<10K"), (99_999, "10K<n<100K"), (10**6, "1M<n<10M")):
         figures = dataclasses.replace(SplitFigures.nothing(), interactions=steps)
         assert size_category([figures]) == said
@@ -395,6 +409,7 @@ def test_what_cannot_be_exported_is_refused_in_one_line(
     where, out = str(store.path), tmp_path / "out"
     said = refused([where, "--out", str(out), "--format", "../hf"], capsys)
     assert "unknown export format '../hf'; allowed: plain, hf" in said
+    assert "an export goes into a folder" in refused([where, "--out", "s3://bucket/data", "--format", "hf"], capsys)
     (tmp_path / "file").write_text("mine")
     (tmp_path / "link").symlink_to("nowhere")
     for name in ("file", "link"):
@@ -430,3 +445,48 @@ def test_a_full_disk_ends_an_export_in_one_line_and_it_goes_on(
     assert "cannot be written (No space left on device); what is finished is in" in said
     assert not (tmp_path / "out").exists()
     assert run(["store", "export", *args]) == 0
+
+
+FAKE_HUB = """
+class Answer:
+    status_code = 401
+class Refused(Exception):
+    response = Answer()
+class HfApi:
+    def __init__(self, endpoint, token):
+        assert (endpoint, token) == ("http://127.0.0.1:1", "hf_of_somebody")
+    def create_repo(self, *args, **kwargs):
+        import os
+        if "REFUSE" in os.environ:
+            raise Refused("no, hf_of_somebody")
+    def upload_folder(self, folder_path, ignore_patterns, **kwargs):
+        assert (folder_path / "README.md").is_file()
+        assert ignore_patterns == [".export/*"]
+"""
+
+
+def test_what_is_known_before_a_push_is_said_before_the_work(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    args = [str(store.path), "--out", str(tmp_path / "out"), "--format", "hf", "--push"]
+    for name in ("data", "me/../data", "me/da ta", "/data", "me/data/x"):
+        assert "is no name of a data set; give USER/NAME" in refused([*args, name], capsys)
+    if importlib.util.find_spec("huggingface_hub") is None:
+        assert "pip install huggingface_hub" in refused([*args, "me/data"], capsys)
+    (tmp_path / "fake").mkdir()
+    (tmp_path / "fake/huggingface_hub.py").write_text(FAKE_HUB)
+    monkeypatch.syspath_prepend(tmp_path / "fake")
+    monkeypatch.delitem(sys.modules, "huggingface_hub", raising=False)
+    monkeypatch.delenv("HF_TOKEN", raising=False)
+    assert "as HF_TOKEN" in refused([*args, "me/data"], capsys)
+    assert not (tmp_path / "out.unfinished").exists()
+    monkeypatch.setenv("HF_TOKEN", "hf_of_somebody")
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:1")
+    monkeypatch.setenv("REFUSE", "1")
+    said = refused([*args, "me/data"], capsys)
+    assert "the Hub answered 401 (the token in HF_TOKEN is not accepted); the same command goes on" in said
+    assert not (tmp_path / "out").exists()
+    monkeypatch.delenv("REFUSE")
+    assert run(["store", "export", *args, "me/data"]) == 0
+    assert not (tmp_path / "out/.export").exists()
+    sys.modules.pop("huggingface_hub")

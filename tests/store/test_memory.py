@@ -3,6 +3,7 @@
 import gc
 import tracemalloc
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,12 @@ COMMANDS: dict[str, Callable[[Store, Path], object]] = {
     "verify": lambda store, _: verify(store, tidy),
     "merge": lambda store, out: merge([store], out, tidy),
     "export": lambda store, out: export(store, out, splits_by_share(store, 0.0, 1), tidy),
+    **{
+        f"export as {name}": partial(
+            lambda name, store, out: export(store, out, splits_by_share(store, 0.0, 1), tidy, format=name), name
+        )
+        for name in ("hf", "lerobot", "webdataset", "minari")
+    },
     "compact": lambda store, _: compact(store, 4, tidy),
 }
 

@@ -57,7 +57,7 @@ class ExportCommand:
 
     store: Annotated[str, tyro.conf.Positional]
     """Folder or s3:// URL of the store."""
-    out: Path
+    out: str
     """A new folder."""
     format: str = "plain"
     """plain (Parquet and Zarr), hf (Parquet with the clouds), lerobot, webdataset, minari, or one of an installed
@@ -70,6 +70,9 @@ class ExportCommand:
     """Instead: a text file with the ids of the objects of the split "train", one a line."""
     test_objects: Path | None = None
     """The same for "test"."""
+    push: str = ""
+    """USER/NAME of a data set on the Hugging Face Hub to put the files into; needs huggingface_hub, and HF_TOKEN in the
+    environment."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object instead of text."""
 
@@ -181,8 +184,11 @@ def _merge(command: MergeCommand) -> int:
 def _export(command: ExportCommand) -> int:
     from learner.data.dataset import read_object_list
     from shared.store import Store, export
+    from shared.store.backends.base import is_url
     from shared.store.maintenance.export import splits_by_share
 
+    if is_url(command.out):
+        raise UsageError(f"{command.out}: an export goes into a folder; name one, and copy it to the bucket afterwards")
     store = Store.open(command.store)
     lists = {"train": read_object_list(command.train_objects), "test": read_object_list(command.test_objects)}
     splits = {name: objects for name, objects in lists.items() if objects is not None}
@@ -191,10 +197,11 @@ def _export(command: ExportCommand) -> int:
     with Progress(f"exporting into {command.out}, shards") as progress:
         done = export(
             store,
-            command.out,
+            Path(command.out),
             splits or splits_by_share(store, command.test_share, command.seed),
             progress.show,
             format=command.format,
+            push=command.push,
         )
     if command.json:
         described = {

@@ -40,6 +40,7 @@ from shared.store.layout import MAX_DOCUMENT_BYTES
 from shared.store.maintenance.croissant import croissant
 from shared.store.maintenance.datacard import SplitFigures, data_card
 from shared.store.maintenance.formats import EXPORT_FORMATS, PLAIN, ExportFormat, Summary
+from shared.store.maintenance.hub import pusher
 from shared.store.maintenance.steps import Content, Piece, Splits, survey
 from shared.store.store import Store
 
@@ -76,7 +77,9 @@ def splits_by_share(store: Store, test_share: float, seed: int) -> dict[str, fro
     return {"train": frozenset(train)} | ({"test": frozenset(test)} if test_share else {})
 
 
-def export(store: Store, out: Path, splits: Splits, progress: Progress | None = None, *, format: str = PLAIN) -> Export:
+def export(
+    store: Store, out: Path, splits: Splits, progress: Progress | None = None, *, format: str = PLAIN, push: str = ""
+) -> Export:
     """Write a store as plain files; `out` is there when all of it is. After a kill or on a full disk, the same goes on.
 
     Args:
@@ -86,10 +89,11 @@ def export(store: Store, out: Path, splits: Splits, progress: Progress | None = 
         progress: called after each shard with how many are done and how many there are; each shard counts when its
             tables are looked through, and again when it is written.
         format: name in `EXPORT_FORMATS`.
+        push: "USER/NAME" of a data set on the Hugging Face Hub, where the files are put, too, before `out` is there.
 
     Raises:
         UsageError: no such format; the folder is there, or cannot be written; or an object is in two splits, or
-            in no store.
+            in no store; or the Hub refuses.
         StoreError: the store is damaged, or a split comes out empty.
     """
     chosen = EXPORT_FORMATS.get(format)
@@ -97,6 +101,7 @@ def export(store: Store, out: Path, splits: Splits, progress: Progress | None = 
     if os.path.lexists(out):
         raise UsageError(f"{out}: is there already; name a new folder")
     say = progress or (lambda done, total: None)
+    deliver = pusher(push, _NOTES) if push else None
     content = survey(store, splits, say)
     folder = out.with_name(out.name + UNFINISHED)
     try:
@@ -106,8 +111,12 @@ def export(store: Store, out: Path, splits: Splits, progress: Progress | None = 
             write_atomically(folder / "setting.json", _json(store.setting.as_document()))
             write_atomically(folder / "README.md", data_card(content, chosen).encode())
             write_atomically(folder / "croissant.json", _json(croissant(content, chosen)))
-            remove_tree(folder / _NOTES)
+            if deliver is not None:
+                deliver(folder)
+            # It names this machine. The other notes stay until the folder has its name: a kill here loses nothing.
+            (folder / _NOTES / DRIVER_LOCK).unlink()
             folder.rename(out)
+            remove_tree(out / _NOTES)
             sync_folder(out.parent)
     except OSError as error:
         why = os.strerror(error.errno) if error.errno else str(error)

@@ -118,11 +118,12 @@ class Content:
     figures: Mapping[str, SplitFigures]
     interactions: Any
     parts: Mapping[str, Sequence[tuple[Part, int, int]]]
-    points: int = field(init=False)
+    _pieces: dict[int | None, list[Piece]] = field(init=False, repr=False, default_factory=dict)
 
-    def __post_init__(self) -> None:
-        """Know N."""
-        object.__setattr__(self, "points", self.store.setting.collection.camera.points)
+    @property
+    def points(self) -> int:
+        """N."""
+        return self.store.setting.collection.camera.points
 
     @property
     def step_bytes(self) -> int:
@@ -150,20 +151,28 @@ class Content:
         Args:
             most_bytes: a piece ends with the shard that brings its clouds above this; None: one piece a split.
         """
-        found: list[Piece] = []
-        for split, parts in self.parts.items():
-            groups: list[list[tuple[Part, int, int]]] = [[]]
-            for part in parts:
-                size = sum(steps for *_, steps in groups[-1]) * self.step_bytes
-                if most_bytes is not None and size >= most_bytes and part[2]:
-                    groups.append([])
-                groups[-1].append(part)
-            episode = step = 0
-            for number, group in enumerate(groups):
-                episodes, steps = sum(each[1] for each in group), sum(each[2] for each in group)
-                shards = tuple(part for part, *_ in group)
-                found.append(Piece(split, number, len(groups), shards, episode, step, episodes, steps))
-                episode, step = episode + episodes, step + steps
+        if most_bytes not in self._pieces:
+            parts = self.parts.items()
+            self._pieces[most_bytes] = [
+                piece for split, each in parts for piece in self._divided(split, each, most_bytes)
+            ]
+        return self._pieces[most_bytes]
+
+    def _divided(self, split: str, parts: Sequence[tuple[Part, int, int]], most_bytes: int | None) -> list[Piece]:
+        groups: list[list[tuple[Part, int, int]]] = [[]]
+        size, step_bytes = 0, self.step_bytes
+        for part in parts:
+            if most_bytes is not None and size >= most_bytes and part[2]:
+                groups.append([])
+                size = 0
+            groups[-1].append(part)
+            size += part[2] * step_bytes
+        found, episode, step = list[Piece](), 0, 0
+        for number, group in enumerate(groups):
+            episodes, steps = sum(each[1] for each in group), sum(each[2] for each in group)
+            shards = tuple(part for part, *_ in group)
+            found.append(Piece(split, number, len(groups), shards, episode, step, episodes, steps))
+            episode, step = episode + episodes, step + steps
         return found
 
 

@@ -1,4 +1,4 @@
-"""Parquet as `datasets`, DuckDB, Polars and Ray Data read it; a row holds all of one step.
+"""Parquet as `datasets`, DuckDB and Polars read it; a row holds all of one step.
 
 OUT/data/<split>-00000-of-00003.parquet
 """

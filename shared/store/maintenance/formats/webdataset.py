@@ -40,6 +40,8 @@ def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
     member = tarfile.TarInfo(name)
     member.size = len(data)
     tar.addfile(member, io.BytesIO(data))
+    # Otherwise it remembers all members until it is closed.
+    tar.members.clear()  # type: ignore[attr-defined]
 
 
 def _without_nan(value: Any) -> Any:
