@@ -8,6 +8,9 @@ from shared.errors import UsageError
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
     "report": ("matplotlib", "plotly", "jinja2"),
+    "ray-data": ("ray", "pandas"),
+    "wandb": ("wandb",),
+    "mlflow": ("mlflow",),
 }
 """Extras of pyproject.toml, and the packages that each brings."""
 
