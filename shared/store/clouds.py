@@ -38,6 +38,18 @@ def observations_at(store: "Store", places: Iterable[tuple[str, int]]) -> Iterat
         yield arrays.observation(index)
 
 
+def check_fields(names: Iterable[str]) -> None:
+    """See that clouds have some fields.
+
+    Raises:
+        UsageError: one they have not.
+    """
+    fields = [kind.name for kind in ARRAYS]
+    for name in names:
+        if name not in fields:
+            raise UsageError(f"clouds have no field '{name}'; allowed: {', '.join(fields)}")
+
+
 def stacked(found: Iterable[Observation], count: int, points: int) -> ObservationArrays:
     """`count` clouds of `points` as arrays."""
     # Filled one by one, since a list of so many arrays would be in memory beside what they are stacked into.
