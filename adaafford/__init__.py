@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from adaafford.heatmaps import write_heatmap
     from adaafford.pretrained import load_policy
     from adaafford.scans import ScanFrame, checked_scan, doubtful_up, observation_of, read_scan
-    from cluster.cli.library import collect, simulated, train
+    from cluster.cli.library import collect, ray_source, simulated, train
     from shared.errors import AdaAffordError
     from shared.policies.adaptation import Adapter
     from shared.policies.policy import Policy
@@ -50,7 +50,7 @@ else:
         "adaafford.heatmaps": ("write_heatmap",),
         "adaafford.pretrained": ("load_policy",),
         "adaafford.scans": ("ScanFrame", "checked_scan", "doubtful_up", "observation_of", "read_scan"),
-        "cluster.cli.library": ("collect", "simulated", "train"),
+        "cluster.cli.library": ("collect", "ray_source", "simulated", "train"),
         "shared.policies.adaptation": ("Adapter",),
         "shared.errors": ("AdaAffordError",),
         "shared.policies.policy": ("Policy",),
@@ -101,6 +101,7 @@ __all__ = [
     "load_policy",
     "observation_of",
     "open_store",
+    "ray_source",
     "read_scan",
     "simulated",
     "train",

@@ -9,6 +9,9 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
     "report": ("matplotlib", "plotly", "jinja2"),
     "import": ("trimesh", "pycollada", "mujoco"),
+    "ray-data": ("ray", "pandas"),
+    "wandb": ("wandb",),
+    "mlflow": ("mlflow",),
 }
 """Extras of pyproject.toml, and the packages that each brings."""
 MODULES = {"pycollada": "collada"}

@@ -1,19 +1,22 @@
 """What a Python program calls instead of the command line; `adaafford` has these names."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shared.config import CollectionConfig, parse
 from shared.errors import UsageError
-from shared.extras import require
+from shared.extras import require, require_packages
 from shared.policies.methods import BASELINES
 from shared.policies.policy import Policy
 from shared.store import Store
+from shared.store.clouds import check_fields
+from shared.store.selection import Condition
 from shared.tasks import task_of
 
 if TYPE_CHECKING:
+    from cluster.cli.ray_source import RaySource
     from collector.sim.simulator import SimEnvironment
     from learner.stages.jobs import StageName
 
@@ -109,3 +112,31 @@ def simulated(objects: str | Path, task: str, seed: int = 1) -> Iterator["SimEnv
             yield environment
         elif index - last >= EMPTY_TURNS * len(refs):
             raise UsageError(f"{folder}: no object comes to rest in view; look at `adaafford objects check --settle`")
+
+
+def ray_source(
+    store: str | Path,
+    columns: Sequence[str] | None = None,
+    where: Sequence[Condition] = (),
+    clouds: Sequence[str] = (),
+) -> "RaySource":
+    """The interactions of a store for `ray.data.read_datasource`: one read task for a group of shards.
+
+    Args:
+        store: folder or s3:// URL, which every node must be able to read.
+        columns: as for `Store.interactions`.
+        where: likewise.
+        clouds: fields of `shared.types.Observation` that become columns of tensors, such as "points"; none: no cloud is
+            read.
+
+    Raises:
+        UsageError: Ray Data is not installed, or there is no such column or field, or a condition is none.
+        StoreError: the store cannot be read.
+    """
+    require_packages("adaafford.ray_source", "ray", "pandas")
+    from cluster.cli.ray_source import RaySource
+
+    opened = Store.open(store)
+    opened.select(columns, where)
+    check_fields(clouds)
+    return RaySource(opened, columns, where, clouds)

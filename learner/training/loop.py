@@ -6,6 +6,7 @@ resumed gives the same bits as one that was not (on one kind of CPU, with one nu
 
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Mapping
@@ -21,8 +22,8 @@ from torch.nn.parallel import DistributedDataParallel
 from learner.settings import METRICS_FILE, TrainingConfig
 from learner.training import data_parallel
 from learner.training.checkpoint import Cursor, check_fingerprint, read_checkpoint, read_cursor, write_checkpoint
-from learner.training.events import EVENTS_FOLDER, EventFiles
 from learner.training.hardware import Hardware
+from learner.training.trackers import Trackers
 from shared.errors import UsageError
 from shared.formatting import finite
 from shared.io.files import read_bounded
@@ -153,7 +154,9 @@ class _Loop:
         if data_parallel.processes() > 1:
             # A gradient that never comes, of what a stage leaves as it is, would otherwise be waited for.
             self._forward = DistributedDataParallel(losses, find_unused_parameters=True)
-        self._viewer = EventFiles(out / EVENTS_FOLDER, self.cursor.step) if data_parallel.rank() == 0 else None
+        self._trackers: Trackers | None = None
+        if data_parallel.rank() == 0:
+            self._trackers = Trackers(out, stage.name, self.cursor.step, os.environ)
         self._saved_at = time.monotonic()
 
     def run(self, title: str, silent: bool) -> TrainingResult:
@@ -174,6 +177,8 @@ class _Loop:
                 self._step()
                 left = math.inf if config.seconds is None else max(config.seconds - self.cursor.seconds, 0.0)
                 progress.show(self.cursor.step, most_left_s=left)
+        if self._trackers is not None:
+            self._trackers.close()
         progress.say(self._summary(title))
         self.stage.module.load_state_dict(self.best)
         self.stage.module.eval()
@@ -250,10 +255,10 @@ class _Loop:
             "validation_seconds": round(time.monotonic() - started, 3),
             "interactions_per_second": round(self.cursor.interactions / max(self.cursor.seconds, 1e-9), 1),
         }
-        if self._viewer is not None:
+        if self._trackers is not None:
             with (self.out / METRICS_FILE).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(finite(line)) + "\n")
-            self._viewer.add(self.cursor.step, finite(line))
+            self._trackers.add(self.cursor.step, finite(line))
 
     def _save(self) -> None:
         if data_parallel.rank() > 0:

@@ -7,7 +7,7 @@ import numpy as np
 
 from shared.config import CameraConfig
 from shared.errors import StoreError, UsageError
-from shared.store.codecs.observations import ObservationArrays, fields_of, kinds
+from shared.store.codecs.observations import ARRAYS, ObservationArrays, fields_of, kinds
 from shared.types import Observation
 
 if TYPE_CHECKING:
@@ -37,6 +37,18 @@ def observations_at(store: "Store", places: Iterable[tuple[str, int]]) -> Iterat
         if not 0 <= index < len(arrays) or arrays.points.shape[1] != points:
             raise StoreError(f"{store.where}: shard {name} has no observation {index}; it is damaged")
         yield arrays.observation(index)
+
+
+def check_fields(names: Iterable[str]) -> None:
+    """See that clouds have some fields.
+
+    Raises:
+        UsageError: one they have not.
+    """
+    fields = [kind.name for kind in ARRAYS]
+    for name in names:
+        if name not in fields:
+            raise UsageError(f"clouds have no field '{name}'; allowed: {', '.join(fields)}")
 
 
 def stacked(found: Iterable[Observation], count: int, camera: CameraConfig) -> ObservationArrays:

@@ -21,8 +21,9 @@ from torch.utils.data import IterableDataset, get_worker_info
 from shared.errors import UsageError
 from shared.seeds import generator
 from shared.store import reader
+from shared.store.clouds import check_fields
 from shared.store.codecs.columns import LIST, interaction_columns
-from shared.store.codecs.observations import ARRAYS, ObservationArrays
+from shared.store.codecs.observations import ObservationArrays
 from shared.store.codecs.tables import column_values
 from shared.store.coverage import Part
 from shared.store.layout import INTERACTIONS_FILE
@@ -72,10 +73,7 @@ class InteractionDataset(IterableDataset[dict[str, Any]]):
             raise UsageError(f"together={together}: give 1 shard or more")
         if seed is not None and seed < 0:
             raise UsageError(f"seed={seed}: give a number of 0 or more, or None for the order of the store")
-        fields = [kind.name for kind in ARRAYS]
-        for name in clouds:
-            if name not in fields:
-                raise UsageError(f"clouds have no field '{name}'; allowed: {', '.join(fields)}")
+        check_fields(clouds)
         opened = store if isinstance(store, Store) else Store.open(store)
         self.columns, self.clouds, self.seed, self.together = tuple(columns), tuple(clouds), seed, together
         self.epoch = 0

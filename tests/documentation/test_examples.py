@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from collector.objects.procedural import generate
+from tests.support.small_trainings import make_store
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -46,6 +47,35 @@ def test_a_scan_is_adapted_to(place: Path) -> None:
     assert "push at" in printed
     with np.load(place / "heatmap.npz") as found:
         assert found["affordance"].shape == (2048,)
+
+
+@pytest.mark.slow
+def test_a_store_is_looked_at_and_trained_from_by_a_network_of_ones_own(place: Path) -> None:
+    make_store(place / "made")
+    printed = example(place, "look.py", "made", "look.png")
+    assert "8 rollouts" in printed
+    assert "of 96 interactions moved something" in printed
+    assert (place / "look.png").read_bytes().startswith(b"\x89PNG")
+    assert "epoch 1: 6 batches" in example(place, "pytorch.py", "made", "net.pt")
+    assert example(place, "pytorch.py", "made", "net.pt") == "goes on in epoch 1\n", "nothing is left"
+
+
+@pytest.mark.slow
+def test_an_object_is_written_and_collected_on(place: Path) -> None:
+    printed = example(place, "own_object.py", "mine", "on-mine")
+    assert printed.count("my-turnstile, bar: ") == 16
+    assert "moved by 0.0" in printed
+
+
+@pytest.mark.slow
+def test_an_ablation_is_trained_and_a_policy_exported(place: Path) -> None:
+    make_store(place / "small")
+    printed = example(place, "ablation.py", "small", "ablation")
+    assert "with augmentation: best" in printed
+    assert "without augmentation: best" in printed
+    printed = example(place, "export.py", "small", "ablation/without-augmentation", "exported")
+    assert "96 interactions; the column `observation` counts the 24 clouds of 64 points" in printed
+    assert "weights in" in printed
 
 
 @pytest.mark.slow

@@ -245,3 +245,30 @@ def test_misuse_of_a_data_set_is_said_in_one_line(store: Store, monkeypatch: pyt
     as_worker(monkeypatch, 0, 2)
     with pytest.raises(UsageError, match=r"rank 0, processes 1, workers 1; here: .*, workers 2"):
         next(iter(again))
+
+
+# Ray Data.
+
+
+def test_without_ray_data_one_line_says_what_to_install(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shared.extras.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match="needs ray and pandas") as raised:
+        adaafford.ray_source(store.where)
+    assert "ray-data" in str(raised.value)
+
+
+@pytest.mark.slow
+def test_ray_data_reads_every_row_and_its_cloud_by_groups_of_shards(store: Store) -> None:
+    pytest.importorskip("pandas")
+    source = adaafford.ray_source(store.where, ["rollout", "step"], [("step", "<", 4)], ["points"])
+    tasks = source.get_read_tasks(3)
+    assert len(tasks) == 3
+    rows = store.interactions(["rollout", "step"], where=[("step", "<", 4)])
+    tables = [table for task in tasks for table in task()]
+    assert [name for table in tables for name in table["rollout"].to_pylist()] == rows["rollout"].to_pylist()
+    clouds = np.concatenate([table["points"].combine_chunks().to_numpy_ndarray() for table in tables])
+    assert np.array_equal(clouds, store.clouds(rows).points)
+    with pytest.raises(UsageError, match="no column"):
+        adaafford.ray_source(store.where, ["colour"])
+    with pytest.raises(UsageError, match="no field"):
+        adaafford.ray_source(store.where, clouds=["colour"])

@@ -10,6 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from learner.training.trackers import Tracker
+
 EVENTS_FOLDER = "tensorboard"
 _VERSION = "brain.Event:2"
 
@@ -32,18 +34,17 @@ class EventFiles:
             self._write(file_version=_VERSION)
             self._write(step=step + 1, session_log=SessionLog(status=SessionLog.START))
 
-    def add(self, step: int, figures: Mapping[str, Any]) -> None:
-        """The figures of a step, each under the stage's name; what is no number is left out."""
+    def add(self, step: int, figures: Mapping[str, float]) -> None:
+        """See `learner.training.trackers.Tracking`."""
         if self._path is None:
             return
         from tensorboard.compat.proto.summary_pb2 import Summary
 
-        values = [
-            Summary.Value(tag=f"{figures['stage']}/{name}", simple_value=value)
-            for name, value in figures.items()
-            if isinstance(value, int | float) and name != "step"
-        ]
+        values = [Summary.Value(tag=name, simple_value=value) for name, value in figures.items()]
         self._write(step=step, summary=Summary(value=values))
+
+    def close(self) -> None:
+        """Nothing is open."""
 
     def _write(self, **content: Any) -> None:
         from tensorboard.compat.proto.event_pb2 import Event
@@ -53,3 +54,6 @@ class EventFiles:
         # An event is rare, so nothing is left open or unwritten whenever the process ends.
         with self._path.open("ab") as file:
             RecordWriter(file).write(Event(wall_time=time.time(), **content).SerializeToString())
+
+
+TENSORBOARD = Tracker(lambda folder, stage, step: EventFiles(folder / EVENTS_FOLDER, step))
