@@ -151,7 +151,7 @@ def as_json(done: CalibratedPolicy) -> dict[str, Any]:
 def calibrated_files(done: CalibratedPolicy, licence: str) -> dict[str, bytes]:
     """weights.safetensors in full precision, policy.json, README.md, the card, and done.json, by name."""
     files = done.policy.to_files()
-    card = (head(done.policy, files, licence), _what_was_done(done), _card_before(done.source))
+    card = (head(done.policy, files, licence, "full"), _what_was_done(done), _card_before(done.source))
     seen = {"stage": "calibrated", "objects": sorted(done.seen)}
     return {**files, CARD_FILE: ("\n\n".join(card) + "\n").encode(), DONE_FILE: json.dumps(seen).encode()}
 
@@ -170,7 +170,7 @@ def _what_was_done(done: CalibratedPolicy) -> str:
     digests = ", ".join(f"`{one[:16]}`" for one in done.digests)
     return f"""## Calibration
 
-The {FITS[done.fit]} of each critic was fitted to {done.interactions:,} interactions ({done.successes:,} successful)
+Fitted: {FITS[done.fit]} of each critic, to {done.interactions:,} interactions ({done.successes:,} successful)
 with {len(done.objects)} objects ({kinds}). Digests of the interactions: {digests}.{doubt}
 
 Cross entropy, nats, on interactions with objects that the fit has not seen (cross-validation over objects); "constant"
@@ -190,5 +190,5 @@ def _card_before(source: str) -> str:
     if not card.is_file():
         return "## Before the calibration\n\nThe policy had no card."
     lines = read_bounded(card, MAX_TABLE_BYTES).decode(errors="replace").splitlines()
-    demoted = "\n".join(f"#{line}" if line.startswith("#") else line for line in lines)
+    demoted = "\n".join(f"##{line}" if line.startswith("#") else line for line in lines)
     return f"## Before the calibration\n\nThe card of the policy as it was:\n\n{demoted}"

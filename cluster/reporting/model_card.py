@@ -151,7 +151,7 @@ def write_export(out: Path, files: Mapping[str, bytes]) -> None:
         write_atomically(out / name, data)
 
 
-def head(policy: Policy, files: dict[str, bytes], licence: str) -> str:
+def head(policy: Policy, files: Mapping[str, bytes], licence: str, precision: str = "half") -> str:
     """The title of a card and what the policy's files are."""
     parameters = sum(tensor.numel() for tensor in policy.modules().parameters())
     return f"""# AdaAfford policy: {policy.task}
@@ -164,7 +164,7 @@ Where2Act prior, Adaptive Affordance Prediction and Adaptive Interaction Proposa
 | task | `{policy.task}` |
 | trained modules | {", ".join(sorted(policy.trained))} |
 | parameters | {parameters:,} |
-| weights | `{WEIGHTS_FILE}`, half precision, {len(files[WEIGHTS_FILE]) / 1e6:.1f} MB; sizes in `{POLICY_FILE}` |
+| weights | `{WEIGHTS_FILE}`, {precision} precision, {len(files[WEIGHTS_FILE]) / 1e6:.1f} MB; sizes in `{POLICY_FILE}` |
 | licence | {licence} |"""
 
 

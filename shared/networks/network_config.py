@@ -44,8 +44,8 @@ class NetworkConfig(StrictModel):
     outcome_features: bool = True
     """Whether an outcome enters with log(1 + m / tau) and r, beside the motion m. As published: not."""
     outcome_details: bool = False
-    """Whether an outcome enters with its kind and the grasp width as well, which tell a part that was held and did not
-    move from a grasp that slipped. As published: not."""
+    """Whether an outcome enters with its kind and the grasp width as well: fingers that held a part which did not move
+    are then told from fingers that closed on nothing. As published: not."""
     products: bool = True
     """Whether actions are multiplied with z and with outcomes, and AAP's D multiplies points with z (see
     `shared.networks.layers.Head`). As published: not."""
