@@ -106,9 +106,11 @@ class DenseClouds:
         """
         at, given = places.numpy(force=True), frames.numpy(force=True)
         profiles = np.empty((*given.shape[:2], PROFILE_WIDTH), np.float32)
-        for number, which in enumerate(cloud.tolist()):
+        asked = cloud.numpy(force=True)
+        for which in np.unique(asked):
             dense = self.points[which].astype(np.float32) @ self.views[which].T.astype(np.float32)
-            profiles[number] = pinch_profiles(dense, at[number], given[number])
+            for number in np.flatnonzero(asked == which):
+                profiles[number] = pinch_profiles(dense, at[number], given[number])
         return torch.cat([frames, torch.as_tensor(profiles, device=frames.device)], dim=-1)
 
 
