@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,8 @@ class MlflowRun:
 
     def __init__(self, folder: Path, stage: str, step: int) -> None:
         require_packages("the tracker mlflow", "mlflow")
-        from mlflow import MlflowClient
-
         uri = os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{folder.absolute() / 'mlflow.db'}"
-        self._client: Any = MlflowClient(tracking_uri=uri)
+        self._client: Any = import_module("mlflow").MlflowClient(tracking_uri=uri)
         known = self._client.get_experiment_by_name(EXPERIMENT)
         experiment = known.experiment_id if known is not None else self._client.create_experiment(EXPERIMENT)
         run = self._client.create_run(experiment, run_name=f"{folder.name}-{stage}-{step}")

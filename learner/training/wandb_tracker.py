@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,7 @@ class WandbRun:
 
     def __init__(self, folder: Path, stage: str, step: int) -> None:
         require_packages("the tracker wandb", "wandb")
-        import wandb
-
+        wandb: Any = import_module("wandb")
         self._stage = stage
         # What it would find out about the machine, its user and the code is not asked for.
         settings = wandb.Settings(
