@@ -174,7 +174,8 @@ def _evaluate(
             exploit_share=settings.exploit_share,
         ),
     )
-    out = out if out is not None else _default_out(subject, setting, folder)
+    if out is None:
+        out = _default_out(subject.evaluations, subject.label, subject.identity, setting, folder)
     evaluation = Evaluation(
         store=Store.create(out / "store", setting),
         policies=subject.files,
@@ -242,9 +243,9 @@ def _possible_methods(policy: Policy) -> tuple[MethodName, ...]:
     return tuple(name for name in METHODS.names() if policy.trained.issuperset(METHODS.get(name).modules))
 
 
-def _default_out(subject: _Subject, setting: Setting, folder: Path) -> Path:
+def _default_out(evaluations: Path, label: str, identity: str, setting: Setting, folder: Path) -> Path:
     """A folder that other settings do not share, and people can tell apart; the same after the objects have moved."""
-    digest = hashlib.sha256(f"{subject.identity} {setting.model_dump_json()}".encode()).hexdigest()
-    begins, ends = f"{setting.task}-", f"-{subject.label}-{digest[:8]}"
-    begun = sorted(subject.evaluations.glob(f"{begins}*{glob.escape(ends)}"))
-    return begun[0] if begun else subject.evaluations / f"{begins}{folder.name or 'objects'}{ends}"
+    digest = hashlib.sha256(f"{identity} {setting.model_dump_json()}".encode()).hexdigest()
+    begins, ends = f"{setting.task}-", f"-{label}-{digest[:8]}"
+    begun = sorted(evaluations.glob(f"{begins}*{glob.escape(ends)}"))
+    return begun[0] if begun else evaluations / f"{begins}{folder.name or 'objects'}{ends}"

@@ -140,7 +140,7 @@ def check_export_folder(out: Path) -> None:
     """
     known = {WEIGHTS_FILE, POLICY_FILE, CARD_FILE, DONE_FILE}
     if out.exists() and (not out.is_dir() or any(path.name not in known for path in out.iterdir())):
-        raise UsageError(f"{out}: holds something that is no exported policy; name a new or an empty folder")
+        raise UsageError(f"{out}: holds something that is not an exported policy; name a new or an empty folder")
 
 
 def write_export(out: Path, files: Mapping[str, bytes]) -> None:

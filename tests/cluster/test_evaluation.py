@@ -264,7 +264,7 @@ def test_evaluate_policy_says_where_its_objects_cannot_be_known(
     monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda *_: None)
     for source, said in ((lone, 1), (exported, 0)):
         evaluate_without_run(str(source), FAST.model_copy(update={"objects": finished / "objects"}), None)
-        assert capsys.readouterr().err.count("does not say what objects it has learned from") == said
+        assert capsys.readouterr().err.count("has no record of its training objects") == said
 
 
 def test_evaluate_policy_with_a_run_is_the_evaluation_of_the_run(

@@ -176,11 +176,11 @@ def test_what_a_policy_has_seen_is_known_through_a_link(tmp_path: Path) -> None:
 def test_an_evaluation_goes_on_in_its_folder_after_its_objects_were_renamed(tmp_path: Path) -> None:
     run = make_finished_run(tmp_path / "a")
     setting = Store.open(run.store).setting
-    out = _default_out(run, setting, tmp_path / "partnet", 1)
+    out = _default_out(run.evaluations, "v1", "1", setting, tmp_path / "partnet")
     assert out.name.startswith("push-faucet-partnet-v1-")
     out.mkdir(parents=True)
-    assert _default_out(run, setting, tmp_path / "data-2", 1) == out
-    assert _default_out(run, setting, tmp_path / "data-2", 2) != out
+    assert _default_out(run.evaluations, "v1", "1", setting, tmp_path / "data-2") == out
+    assert _default_out(run.evaluations, "v2", "2", setting, tmp_path / "data-2") != out
 
 
 def test_other_software_is_named_with_what_differs() -> None:

@@ -178,7 +178,7 @@ def test_what_cannot_be_calibrated_is_refused_in_one_line(
     for given, expected in (
         (["--policy", "pull-closed-door", *where], "the policy for 'pull-closed-door'"),
         ([*own, "--store", str(tmp_path / "gone"), *where[2:]], "gone"),
-        ([*own, *where[:2], "--out", str(tmp_path / "full")], "holds something that is no exported policy"),
+        ([*own, *where[:2], "--out", str(tmp_path / "full")], "holds something that is not an exported policy"),
         (["--policy", str(tmp_path / "lone"), *where], "prior is not trained"),
         ([*own, "--store", str(few.where), *where[2:]], "failures on 2 objects are too few to calibrate on"),
         ([*own, *where[:2], "--out", str(policy_folder)], "name another folder, so that it is kept"),
