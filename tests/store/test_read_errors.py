@@ -99,8 +99,10 @@ def disturb(name: str, where: str, digest: str, fault: Fault, out: Path) -> tupl
             failed = True
             assert fault.step, error
             assert "\n" not in str(error)
-            # Locks and listings of one moment may be refused in other words; what is read never is.
-            assert isinstance(error, UnreadableError) or "cannot" in str(error) or "no such" in str(error), error
+            # Locks and listings of one moment may be refused in other words; what is read never is. Where a file has
+            # vanished, the message names the place and says what is not there.
+            words = (where, str(out)) if fault.kind == "vanished" else ("cannot", "no such")
+            assert isinstance(error, UnreadableError) or any(said in str(error) for said in words), error
         except OSError:
             failed = True  # The command line says it in one line.
     what = f"{name}, {fault.kind} at step {fault.step}: {steps[fault.step - 1 : fault.step]}"
