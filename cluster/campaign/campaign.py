@@ -37,8 +37,9 @@ from shared.io.text import plain
 from shared.plan import Plan, Setting
 from shared.policies.methods import baselines_of
 from shared.policies.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
+from shared.software import software_versions
 from shared.store import Store
-from shared.store.provenance import changed_versions, software_versions
+from shared.store.provenance import changed_versions
 
 
 def steps_of(config: CampaignConfig) -> list[AlternationStep]:

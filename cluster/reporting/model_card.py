@@ -17,8 +17,8 @@ from shared.io.files import make_folder, read_bounded, write_atomically
 from shared.io.text import markdown
 from shared.plan import ObjectRef
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
+from shared.software import software_versions
 from shared.store import Store
-from shared.store.provenance import software_versions
 
 CARD_FILE = "README.md"
 MAX_TABLE_BYTES = 1 << 20

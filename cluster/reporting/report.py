@@ -19,8 +19,8 @@ from shared.formatting import terminal_table
 from shared.io.files import write_atomically
 from shared.io.text import plain
 from shared.policies.policy import Policy
+from shared.software import software_versions
 from shared.store import Store
-from shared.store.provenance import software_versions
 
 
 def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, say: Callable[[str], None]) -> None:

@@ -30,8 +30,8 @@ from shared.errors import UsageError
 from shared.io.documents import parse_object
 from shared.io.files import create_exclusively, read_bounded, write_atomically
 from shared.plan import ObjectRef
+from shared.software import software_versions
 from shared.store.maintenance.difference import differences
-from shared.store.provenance import software_versions
 
 MAX_DOCUMENT_BYTES = 64 << 20
 PLACE_SETTINGS = ("objects", "object_list", "start_from", "splits.train_list", "splits.test_list", "ray_address")

@@ -18,7 +18,7 @@ from shared.errors import StoreError
 from shared.io.documents import parse_document
 from shared.io.files import read_bounded, temporary_name
 from shared.plan import ObjectRef
-from shared.store.provenance import software_versions
+from shared.software import software_versions
 
 PLACES = 10_000
 """Two objects that share one drop each other: of 1,000 objects, that is one in twenty."""

@@ -8,43 +8,24 @@ what tells of the moment, which no copy, export or digest takes along.
 
 import json
 import os
-import platform
-import re
 from collections.abc import Mapping
 from contextlib import suppress
-from functools import cache
-from importlib import metadata
-from pathlib import Path
 
 from shared.errors import StoreError
 from shared.io.files import host_name, machine_name
+from shared.software import COMMIT, software_versions
 from shared.store.backends.base import StorageBackend
 from shared.store.codecs.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, fingerprint
 from shared.store.layout import STATUS_FOLDER
 
 SCHEMA = "schema"
 """Name of the fingerprint of the columns, beside the packages."""
-_COMMIT = "git_commit"
-_PACKAGES = ("adaafford", "numpy", "pyarrow", "zarr", "torch", "sapien", "ray", "embreex")
 
 _MAX_NOTE_BYTES = 1 << 12
 
 
-@cache
-def software_versions() -> dict[str, str]:
-    """Versions of Python and of the packages that data depend on, without importing them."""
-    versions = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    commit = _git_commit(Path(__file__).resolve().parents[2])
-    return versions | ({_COMMIT: commit} if commit else {})
-
-
 def store_software() -> dict[str, str]:
-    """The same, and a fingerprint of the columns that this software knows, for documents of a store."""
+    """Versions of the software, and a fingerprint of the columns that it knows, for documents of a store."""
     return software_versions() | {SCHEMA: fingerprint(ROLLOUT_COLUMNS, INTERACTION_COLUMNS)}
 
 
@@ -78,17 +59,6 @@ def changed_versions(before: Mapping[str, str], now: Mapping[str, str] | None = 
     The commit is left out: it changes with every checkout, and what it changes shows in the rest or in the digest.
     """
     now = store_software() if now is None else now
-    compared = [name for name in sorted(before.keys() | now.keys()) if name != _COMMIT]
+    compared = [name for name in sorted(before.keys() | now.keys()) if name != COMMIT]
     names = [name for name in compared if before.get(name) != now.get(name) and (name != SCHEMA or name in before)]
     return ", ".join(f"{name} {before.get(name, 'none')[:40]} (now {now.get(name, 'none')[:40]})" for name in names)
-
-
-def _git_commit(root: Path) -> str:
-    """The commit that a checkout stands at, read from its files; "" where that is not known."""
-    try:
-        head = (root / ".git" / "HEAD").read_text(encoding="utf-8").strip()
-        if head.startswith("ref: "):
-            head = (root / ".git" / head.removeprefix("ref: ")).read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError):
-        return ""
-    return head if re.fullmatch(r"[0-9a-f]{40,64}", head) else ""

@@ -310,7 +310,7 @@ def keep(result: dict[str, Any], folder: Path, name: str) -> Path:
     Raises:
         UsageError: the folder cannot be made or written.
     """
-    from shared.store.provenance import software_versions
+    from shared.software import software_versions
 
     now = datetime.now(UTC)
     path = folder / f"{now:%Y-%m-%d}-{name}.json"
