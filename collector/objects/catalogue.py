@@ -88,7 +88,7 @@ def scan(path: Path, *object_lists: Path, anew: bool = False) -> Catalogue:
     elif all(reader_of(folder) is None for folder in folders.values()):
         layouts = ", ".join(READERS.names())
         raise UsageError(f"{path}: holds no object; name a folder of objects ({layouts}), or one object's folder")
-    usable, refused, cache = [], [], ScanCache(cache_folder("objects"))
+    usable, refused, cache = [], [], ScanCache()
     for object_id in sorted(folders):
         try:
             usable.append(_entry(folders[object_id], path, cache, anew))

@@ -14,9 +14,10 @@ from pathlib import Path
 
 from collector.objects.articulation import PartSummary
 from shared.config import StrictModel
-from shared.errors import StoreError
+from shared.errors import StoreError, UsageError
 from shared.io.documents import parse_document
 from shared.io.files import read_bounded, temporary_name
+from shared.io.private import cache_folder
 from shared.plan import ObjectRef
 from shared.software import software_versions
 
@@ -52,17 +53,21 @@ class _Kept(StrictModel):
 class ScanCache:
     """What was found in object folders, by their paths.
 
-    Args:
-        cache: a folder of this user; what is in it is checked, and of no account where it cannot be read or written.
+    Files of the cache are checked when they are read. Where there is no place for a cache, or it cannot be read or
+    written, objects are read anew.
     """
 
-    def __init__(self, cache: Path) -> None:
-        self._cache = cache
+    def __init__(self) -> None:
+        self._cache: Path | None = None
+        with suppress(UsageError):
+            self._cache = cache_folder("objects")
 
     def get(self, folder: Path, tree: Path) -> Found | None:
         """What was found in `folder` below the scanned `tree`; None if nothing is known, or anything has changed."""
+        if self._cache is None:
+            return None
         try:
-            place = self._place(folder)
+            place = _place(self._cache, folder)
             kept = parse_document(_Kept, read_bounded(place, MAX_BYTES), str(place), "it is read anew")
             if kept.folder != _absolute(folder) or kept.tree != _absolute(tree) or kept.software != software_versions():
                 return None
@@ -82,6 +87,8 @@ class ScanCache:
             begun: when the first of them was read, nanoseconds since 1970; files that changed about then or later keep
                 anything from being remembered.
         """
+        if self._cache is None:
+            return
         with suppress(OSError, ValueError):
             # The folder itself changes with the names in it, by which readers tell layouts apart.
             files = {name: _signature(folder / name) for name in sorted({".", *asked})}
@@ -93,7 +100,7 @@ class ScanCache:
             data = kept.model_dump_json().encode()
             if len(data) > MAX_BYTES:
                 return
-            place = self._place(folder)
+            place = _place(self._cache, folder)
             temporary = place.with_name(temporary_name(place.name))
             try:
                 # Bytes that a crash loses are read anew, so nothing waits for the disk.
@@ -102,9 +109,10 @@ class ScanCache:
             finally:
                 temporary.unlink(missing_ok=True)
 
-    def _place(self, folder: Path) -> Path:
-        number = int.from_bytes(hashlib.sha256(os.fsencode(_absolute(folder))).digest()[:8], "big") % PLACES
-        return self._cache / f"{number:04}.json"
+
+def _place(cache: Path, folder: Path) -> Path:
+    number = int.from_bytes(hashlib.sha256(os.fsencode(_absolute(folder))).digest()[:8], "big") % PLACES
+    return cache / f"{number:04}.json"
 
 
 def _absolute(path: Path) -> str:

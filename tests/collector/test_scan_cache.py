@@ -11,6 +11,7 @@ from collector.objects import scan_cache
 from collector.objects.catalogue import scan
 from collector.objects.files import ObjectFiles
 from collector.objects.procedural import generate
+from shared.errors import UsageError
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +129,20 @@ def test_a_cache_that_cannot_be_written_is_of_no_account(objects: Path, tmp_path
         place.unlink()
         place.mkdir()
     assert scan(objects) == first
+
+
+def test_without_a_place_for_a_cache_objects_are_read_anew(
+    objects: Path, read: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = scan(objects)
+
+    def refuse(name: str) -> Path:
+        raise UsageError(f"there is no place for {name}")
+
+    monkeypatch.setattr(scan_cache, "cache_folder", refuse)
+    read.clear()
+    assert scan(objects) == first
+    assert set(read) == {"faucet-0000", "faucet-0001"}
 
 
 def test_another_tree_is_asked_anew(objects: Path, read: list[str]) -> None:
