@@ -1,22 +1,15 @@
 """A process that decomposes meshes by CoACD, one after another, until its standard input ends.
 
-Each message, either way, is a length (unsigned 64 bits) and a list of meshes (`collector.objects.mesh_bytes`): one
-mesh in, its convex pieces out. The library cannot be interrupted, and a strange mesh may end its process, so it runs
-in a separate one.
+Each message, either way, is a list of meshes (`collector.objects.mesh_bytes`): one mesh in, its convex pieces out. The
+library cannot be interrupted, and a strange mesh may end its process, so it runs in a separate one.
 """
-
-import os
-import signal
-import struct
-import sys
-from typing import IO
 
 import coacd
 
 from collector.objects.articulation import Mesh
+from collector.objects.child_process import answer_all
 from collector.objects.mesh_bytes import MAX_ENCODED_BYTES, decode, encode
 
-LENGTH = struct.Struct("<Q")
 MAX_PIECES = 16
 """Of one mesh."""
 SETTINGS: dict[str, float | int | bool] = {
@@ -33,45 +26,16 @@ SETTINGS: dict[str, float | int | bool] = {
 """What determines the pieces; part of what cached pieces are known by."""
 
 
-def send(stream: IO[bytes], meshes: list[Mesh]) -> None:
-    """Write one message."""
-    data = encode(meshes)
-    stream.write(LENGTH.pack(len(data)) + data)
-    stream.flush()
-
-
-def receive(stream: IO[bytes]) -> tuple[Mesh, ...]:
-    """Read one message.
-
-    Raises:
-        EOFError: the stream ends.
-        ValueError: the message is malformed.
-    """
-    head = stream.read(LENGTH.size)
-    if len(head) < LENGTH.size:
-        raise EOFError
-    (length,) = LENGTH.unpack(head)
-    if length > MAX_ENCODED_BYTES:
-        raise ValueError("a message is too long")
-    return decode(stream.read(length))
+def _answer(question: bytes) -> bytes:
+    (mesh,) = decode(question)
+    found = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **SETTINGS)
+    return encode([Mesh(vertices, faces) for vertices, faces in found])
 
 
 def main() -> None:
-    """Decompose what comes in, each mesh within as many seconds of CPU time as the first argument says."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    # Whatever the library prints must not end up among the answers.
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    """Decompose what comes in, one mesh after another."""
     coacd.set_log_level("off")
-    while True:
-        try:
-            (mesh,) = receive(sys.stdin.buffer)
-        except EOFError:
-            return
-        # Its signal ends the process. Time on the clock would make it depend on what else the machine does.
-        signal.setitimer(signal.ITIMER_PROF, float(sys.argv[1]))
-        found = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **SETTINGS)
-        signal.setitimer(signal.ITIMER_PROF, 0.0)
-        send(answers, [Mesh(vertices, faces) for vertices, faces in found])
+    answer_all(_answer, MAX_ENCODED_BYTES)
 
 
 if __name__ == "__main__":

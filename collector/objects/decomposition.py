@@ -6,12 +6,9 @@ The cache is shared by all processes of a machine. Its entries are checked like 
 or does not fit its mesh is computed again.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import json
-import signal
-import subprocess
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -21,11 +18,11 @@ import numpy as np
 
 from collector.objects.articulation import ArticulatedObject, Body, Mesh
 from collector.objects.bounds import check_bounds
-from collector.objects.coacd_process import MAX_PIECES, SETTINGS, receive, send
+from collector.objects.child_process import ChildProcess
+from collector.objects.coacd_process import MAX_PIECES, SETTINGS
 from collector.objects.mesh_bytes import MAX_ENCODED_BYTES, decode, encode
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.io.files import read_bounded, remove_tree, write_atomically
-from shared.io.interpreter import PYTHON, own_environment
 
 LIMIT_S = 120.0
 """CPU time for one mesh; the largest of published objects take some 20 s."""
@@ -49,7 +46,7 @@ class Decomposer:
 
     def __init__(self, cache: Path) -> None:
         self._cache = cache
-        self._child: subprocess.Popen[bytes] | None = None
+        self._child = ChildProcess("collector.objects.coacd_process", MAX_ENCODED_BYTES)
         self._salt = json.dumps([version("coacd"), SETTINGS], sort_keys=True).encode()
 
     def __enter__(self) -> "Decomposer":
@@ -58,9 +55,7 @@ class Decomposer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._child is not None:
-            self._child.kill()
-        self._end_child()
+        self._child.close()
 
     def decomposed(
         self, target: ArticulatedObject, progress: Callable[[int, int], None] | None = None
@@ -115,45 +110,20 @@ class Decomposer:
 
     def _computed(self, mesh: Mesh) -> tuple[Mesh, ...]:
         """The pieces, or none where one is enough."""
-        child = self._running()
-        assert child.stdin is not None
-        assert child.stdout is not None
         try:
-            send(child.stdin, [mesh])
-            found = receive(child.stdout)
-        except (EOFError, ValueError, BrokenPipeError):
-            too_slow = self._end_child() == -signal.SIGPROF
-            what = f"takes longer than {LIMIT_S:g} s to decompose" if too_slow else "cannot be decomposed by CoACD"
+            found = decode(self._child.ask(encode([mesh]), LIMIT_S))
+        except (EOFError, ValueError):
+            what = (
+                f"takes longer than {LIMIT_S:g} s to decompose"
+                if self._child.end()
+                else "cannot be decomposed by CoACD"
+            )
             raise ObjectError(f"a mesh of {len(mesh.faces)} triangles {what}; use convex hulls") from None
         if len(found) <= 1:
             return ()
         if not _fits(found, mesh):
             raise ObjectError("CoACD's pieces do not fit their mesh; use convex hulls")
         return found
-
-    def _running(self) -> "subprocess.Popen[bytes]":
-        if self._child is None or self._child.poll() is not None:
-            self._child = subprocess.Popen(
-                [*PYTHON, "-m", "collector.objects.coacd_process", str(LIMIT_S)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                # Sums over several threads would depend on how many there are.
-                env={**own_environment(), "OMP_NUM_THREADS": "1"},
-            )
-        return self._child
-
-    def _end_child(self) -> int:
-        """End the process, if there is one; returns its exit code, or minus the signal that it died of."""
-        if self._child is None:
-            return 0
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            # One that failed is about to be gone, and how tells why.
-            self._child.wait(0.2)
-        self._child.kill()
-        self._child.communicate()
-        code, self._child = self._child.returncode, None
-        return code
 
 
 def _is_flat(mesh: Mesh) -> bool:

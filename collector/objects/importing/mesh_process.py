@@ -1,18 +1,14 @@
 """A process that reads meshes by trimesh, one after another, until its standard input ends.
 
-A message is a length (unsigned 64 bits), the file's ending (8 bytes, blanks at its end) and the file; an answer is a
-length, a letter, and a list of meshes (`collector.objects.mesh_bytes`) or, after "e", what is wrong. Files come from
-anybody, and the readers have no bounds of their own, so they run in a process that has: on memory and on time.
+A question is the file's ending (8 bytes, blanks at its end) and the file. An answer is "m" and a list of meshes
+(`collector.objects.mesh_bytes`), or "e" and what is wrong. Files come from anybody, and the readers have no bounds of
+their own, so they run in a process that has: on memory and on time.
 """
 
 import json
-import os
 import resource
-import signal
 import struct
-import sys
 from io import BytesIO
-from typing import IO
 from xml.etree.ElementTree import Element
 
 import defusedxml.ElementTree
@@ -20,9 +16,11 @@ import numpy as np
 import trimesh
 
 from collector.objects.articulation import Mesh
+from collector.objects.child_process import answer_all
+from collector.objects.importing.mesh_files import ENDING_BYTES
 from collector.objects.mesh_bytes import encode
+from collector.objects.meshes import MAX_OBJ_BYTES
 
-LENGTH, ENDING = struct.Struct("<Q"), struct.Struct("<8s")
 MAX_MEMORY = 4 << 30
 """Bytes of address space beyond what the libraries take."""
 _GLB_HEAD = struct.Struct("<4sIIII")
@@ -67,33 +65,21 @@ def _check_glb(data: bytes) -> None:
             raise ValueError("it names other files; export it as one self-contained file")
 
 
-def _receive(stream: IO[bytes]) -> tuple[bytes, str] | None:
-    head = stream.read(LENGTH.size + ENDING.size)
-    if len(head) < LENGTH.size + ENDING.size:
-        return None
-    (length,), (ending,) = LENGTH.unpack_from(head), ENDING.unpack_from(head, LENGTH.size)
-    return stream.read(length), ending.decode().rstrip()
+def _answer(question: bytes) -> bytes:
+    try:
+        return b"m" + encode([read_mesh(question[ENDING_BYTES:], question[:ENDING_BYTES].decode().rstrip())])
+    except MemoryError:
+        return b"e" + b"it needs too much memory"
+    except Exception as error:  # noqa: BLE001 - whatever a reader makes of a file from outside.
+        return b"e" + f"{type(error).__name__}: {error}".encode("utf-8", "replace")
 
 
 def main() -> None:
-    """Read what comes in, each mesh within as many seconds of CPU time as the first argument says."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    # Whatever a library prints must not end up among the answers.
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    """Read what comes in, one file after another."""
     with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123 - no regular file.
         taken = int(file.read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (taken + MAX_MEMORY, taken + MAX_MEMORY))
-    while (received := _receive(sys.stdin.buffer)) is not None:
-        signal.setitimer(signal.ITIMER_PROF, float(sys.argv[1]))
-        try:
-            answer = b"m" + encode([read_mesh(*received)])
-        except MemoryError:
-            answer = b"e" + b"it needs too much memory"
-        except Exception as error:  # noqa: BLE001 - whatever a reader makes of a file from outside.
-            answer = b"e" + f"{type(error).__name__}: {error}".encode("utf-8", "replace")
-        signal.setitimer(signal.ITIMER_PROF, 0.0)
-        answers.write(LENGTH.pack(len(answer)) + answer)
-        answers.flush()
+    answer_all(_answer, ENDING_BYTES + MAX_OBJ_BYTES)
 
 
 if __name__ == "__main__":
