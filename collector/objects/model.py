@@ -3,7 +3,7 @@
 Objects are made, imported and exported in this form: frames of links are nobody's business but the file's.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -108,10 +108,20 @@ def bodies_of(model: ObjectModel) -> tuple[Body, ...]:
 
 def transformed(model: ObjectModel, rotation: Float, scale: float, centre: Float) -> ObjectModel:
     """`model` about `centre`, turned and scaled."""
+    return mapped(model, lambda points: (points - centre) @ rotation.T * scale, lambda axis: rotation @ axis, scale)
 
-    def place(points: Float) -> Float:
-        moved: Float = (points - centre) @ rotation.T * scale
-        return moved
+
+def mapped(
+    model: ObjectModel, place: Callable[[Float], Float], turn: Callable[[Float], Float], scale: float
+) -> ObjectModel:
+    """`model` with all of it in other places.
+
+    Args:
+        model: an object.
+        place: where points [..., 3] go.
+        turn: where directions [3] point.
+        scale: what lengths are multiplied by.
+    """
 
     def place_all(pieces: Pieces) -> Pieces:
         return tuple(Mesh(place(piece.vertices), piece.faces) for piece in pieces)
@@ -122,7 +132,7 @@ def transformed(model: ObjectModel, rotation: Float, scale: float, centre: Float
             part,
             pieces=place_all(part.pieces),
             origin=point(place(np.array(part.origin))),
-            axis=point(rotation @ np.array(part.axis)),
+            axis=point(turn(np.array(part.axis))),
             upper=part.upper * length,
             lower=part.lower * length,
             collisions=None if part.collisions is None else place_all(part.collisions),

@@ -1,11 +1,8 @@
 """An object under construction: a static body and the parts that hang on it, all in one frame, all closed."""
 
-from dataclasses import replace
-
 import numpy as np
 
-from collector.objects.articulation import Mesh
-from collector.objects.model import MovablePart, ObjectModel, Pieces, Point, point
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point, bounding_box, mapped, point
 from shared.types import Float
 
 GRID = 2.0**-14
@@ -46,26 +43,11 @@ def sliding(name: str, pieces: Pieces, direction: Point, upper: float) -> Movabl
 
 def normalised(assembly: ObjectModel) -> ObjectModel:
     """The object about the origin, its bounding box's diagonal 2, as PartNet-Mobility has it, on the grid."""
-    everything = [*assembly.body, *(piece for part in assembly.parts for piece in part.pieces)]
-    vertices = np.concatenate([piece.vertices for piece in everything])
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = bounding_box(assembly)
     scale, centre = 2.0 / float(np.linalg.norm(high - low)), (low + high) / 2
 
     def place(vectors: Float) -> Float:
         steps: Float = np.round((vectors - centre) * scale / GRID)
         return steps * GRID
 
-    def place_all(pieces: Pieces) -> Pieces:
-        return tuple(Mesh(place(piece.vertices), piece.faces) for piece in pieces)
-
-    def place_part(part: MovablePart) -> MovablePart:
-        length = 1.0 if part.kind == "revolute" else scale
-        return replace(
-            part,
-            pieces=place_all(part.pieces),
-            origin=point(place(np.array(part.origin))),
-            lower=part.lower * length,
-            upper=part.upper * length,
-        )
-
-    return replace(assembly, body=place_all(assembly.body), parts=tuple(place_part(part) for part in assembly.parts))
+    return mapped(assembly, place, lambda axis: axis, scale)
