@@ -3,14 +3,12 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import pyarrow as pa
 from ray.data.block import BlockMetadata
 from ray.data.datasource import Datasource, ReadTask
 from ray.data.extensions import ArrowTensorArray
 
-from shared.store import Store, reader
+from shared.store import Store
 from shared.store.coverage import Part
-from shared.store.layout import INTERACTIONS_FILE
 from shared.store.selection import Condition
 
 
@@ -51,9 +49,7 @@ class RaySource(Datasource):
         """A table for each shard."""
         store = Store.open(self._where)
         selection = store.select(self._columns, self._conditions)
-        for part, _, table in reader.read_tables(store.backend, parts, INTERACTIONS_FILE, selection.read):
-            rows = selection.of_table(table)
-            rows = rows.append_column("shard", pa.array([part.shard.shard_id] * len(rows), pa.string()))
+        for rows in store.selected(selection, parts):
             if self._clouds:
                 clouds = store.clouds(rows)
                 for name in self._clouds:

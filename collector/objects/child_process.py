@@ -1,7 +1,7 @@
 """Processes for libraries that may hang, crash or take too much memory on a strange mesh, and the messages to them.
 
-A message is a length (unsigned 64 bits) and so many bytes; a question begins with the time for its answer (64 bits). The
-parent calls `ChildProcess.ask`, and the module that the child runs calls `answer_all`.
+A message is a length (unsigned 64 bits) and so many bytes; a question begins with the time for its answer (64 bits).
+The parent calls `ChildProcess.ask`, and the module that the child runs calls `answer_all`.
 """
 
 import contextlib

@@ -6,7 +6,7 @@ table = store.interactions(["point", "success"])          # a learner
 clouds = store.clouds(table)
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from itertools import islice
@@ -353,8 +353,8 @@ class Store:
         """What is selected from one of the two tables of all shards, and which shard each row is of."""
         tables = [_with_shard(selection.schema.empty_table(), "")]
         few: list[Any] = []
-        for part, _, table in self.each(file, selection.read, plan_keys):
-            few.append(_with_shard(selection.of_table(table), part.shard.shard_id))
+        for table in self._selected(file, selection, self._parts_of(plan_keys)):
+            few.append(table)
             if len(few) == _TABLES_AT_ONCE:
                 # Copied together: a column of one shard takes far more memory than its numbers.
                 tables.append(pa.concat_tables(few).combine_chunks())
@@ -365,8 +365,18 @@ class Store:
         self, file: str, names: Sequence[str] | None = None, plan_keys: Sequence[str] | None = None
     ) -> Iterator[tuple[Part, ShardManifest, Any]]:
         """What counts of each shard, its manifest, and one of its tables (see `reader.read_tables`), in order."""
-        parts = (part for part in self.parts() if plan_keys is None or part.shard.plan_key in plan_keys)
-        return reader.read_tables(self.backend, parts, file, names)
+        return reader.read_tables(self.backend, self._parts_of(plan_keys), file, names)
+
+    def _parts_of(self, plan_keys: Sequence[str] | None) -> Iterable[Part]:
+        return (part for part in self.parts() if plan_keys is None or part.shard.plan_key in plan_keys)
+
+    def selected(self, selection: Selection, parts: Iterable[Part]) -> Iterator[Any]:
+        """What `select` chose of the interactions of some shards, a table each; raises as `interactions` does."""
+        return self._selected(INTERACTIONS_FILE, selection, parts)
+
+    def _selected(self, file: str, selection: Selection, parts: Iterable[Part]) -> Iterator[Any]:
+        for part, _, table in reader.read_tables(self.backend, parts, file, selection.read):
+            yield _with_shard(selection.of_table(table), part.shard.shard_id)
 
     def read_observations(self, shard_id: str) -> ObservationArrays:
         """All clouds of a shard.
