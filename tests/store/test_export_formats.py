@@ -26,7 +26,7 @@ from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store, export
 from shared.store.maintenance.datacard import SplitFigures, size_category
 from shared.store.maintenance.formats import EXPORT_FORMATS, word
-from shared.store.maintenance.steps import Content
+from shared.store.maintenance.steps import Content, survey
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
 from tests.support.faults import Fault, disk_faults
 
@@ -345,6 +345,21 @@ def test_an_export_begins_anew_where_the_store_or_the_command_is_another(store: 
     export(store, tmp_path / "out", SPLITS, format="hf")
     export(store, tmp_path / "whole", SPLITS, format="hf")
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_what_others_commit_during_an_export_is_in_neither_its_files_nor_its_digest(tmp_path: Path) -> None:
+    growing = make(tmp_path / "growing")
+    before, steps = growing.digest(), len(growing.interactions())
+
+    def commit_another(done: int, total: int) -> None:
+        job = Job(PLANS[1].key, 4, 6)
+        if not growing.holds(job):
+            growing.commit(PLANS[1], job, [fabricate_rollout(PLANS[1], index, 3, 2) for index in (4, 5)], {})
+
+    content = survey(growing, SPLITS, commit_another)
+    assert growing.digest() != before
+    assert content.digest == before
+    assert sum(piece.steps for piece in content.pieces(None)) == steps
 
 
 def test_a_file_that_was_lost_of_an_unfinished_export_is_written_again(

@@ -157,8 +157,8 @@ def _unfinished(folder: Path, identity: dict[str, Any]) -> Iterator[None]:
 
 def _pieces(content: Content, chosen: ExportFormat, folder: Path, progress: Progress) -> Iterator[dict[str, Any]]:
     """Write the pieces that are not there yet; what is known of each, in order."""
-    pieces, seen = content.pieces(chosen.piece_bytes), len(content.store.parts())
-    total, done = seen + sum(len(piece.parts) for piece in pieces), seen
+    pieces, done = content.pieces(chosen.piece_bytes), content.shards
+    total = done + sum(len(piece.parts) for piece in pieces)
     for number, piece in enumerate(pieces):
         note = folder / _NOTES / f"{number}.json"
         receipt = _note(note)

@@ -24,6 +24,7 @@ from shared.store.codecs.observations import ObservationArrays
 from shared.store.codecs.tables import joined, schema_of, unknown_columns
 from shared.store.coverage import ROLLOUT_COLUMN, Part
 from shared.store.maintenance.datacard import SplitFigures
+from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
 GROUP_BYTES = 16 << 20
@@ -110,6 +111,7 @@ class Content:
         figures: of each split.
         interactions: schema of the table of interactions, with the columns of newer software.
         parts: of each split, the shards with rows of it, and how many episodes and steps these are.
+        shards: how many there are in all.
     """
 
     store: Store
@@ -118,6 +120,7 @@ class Content:
     figures: Mapping[str, SplitFigures]
     interactions: Any
     parts: Mapping[str, Sequence[tuple[Part, int, int]]]
+    shards: int
     _pieces: dict[int | None, list[Piece]] = field(init=False, repr=False, default_factory=dict)
 
     @property
@@ -191,6 +194,8 @@ def survey(store: Store, splits: Splits, progress: Callable[[int, int], None]) -
     parts: dict[str, list[tuple[Part, int, int]]] = {split: [] for split in splits}
     unknown: list[Any] = []
     there = store.parts()
+    # What others commit meanwhile is in neither the files nor the digest.
+    store = store.as_of(Snapshot.of(there))
     for done, part in enumerate(there, 1):
         rollouts, rows = store.tables_of(part)
         of_newer = unknown_columns(rows.slice(0, 0), INTERACTION_COLUMNS, ROLLOUT_COLUMN)
@@ -208,7 +213,7 @@ def survey(store: Store, splits: Splits, progress: Callable[[int, int], None]) -
             raise StoreError(f"split '{split}' has no interaction; list other objects, or collect more")
     known = schema_of(interaction_columns(store.setting.dynamics.added))
     more = [each for each in joined(unknown, store.where).schema if each.name != ROLLOUT_COLUMN] if unknown else []
-    return Content(store, store.digest(), splits, figures, pa.schema([*known, *more]), parts)
+    return Content(store, store.digest(), splits, figures, pa.schema([*known, *more]), parts, len(there))
 
 
 def of_objects(table: Any, objects: frozenset[str]) -> Any:
