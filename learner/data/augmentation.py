@@ -34,6 +34,8 @@ def draw_flips(count: int, config: AugmentationConfig, rng: np.random.Generator)
 
 def turn_frames(turns: Tensor, frames: Tensor) -> Tensor:
     """Frames with or without pinch profiles, [B, n, 6 or more], after the turns [B, 3, 3]."""
+    if frames.shape[-1] == FRAME_WIDTH:
+        return turn_vectors(turns, frames)
     turned = torch.cat([turn_vectors(turns, frames[..., :FRAME_WIDTH]), frames[..., FRAME_WIDTH:]], dim=-1)
     # A mirror keeps approach and forward, and so swaps the fingers.
     return torch.where((torch.linalg.det(turns) < 0)[:, None, None], swapped_fingers(turned), turned)
@@ -41,7 +43,7 @@ def turn_frames(turns: Tensor, frames: Tensor) -> Tensor:
 
 def flip_frames(flips: Tensor, frames: Tensor) -> Tensor:
     """Frames with or without pinch profiles, [B, n, 6 or more], turned about the approach in the sets `flips`, [B]."""
-    return torch.where(flips[:, None, None], turned_over(frames), frames)
+    return torch.where(flips[:, None, None], turned_over(frames), frames) if flips.any() else frames
 
 
 def turn_vectors(turns: Tensor, vectors: Tensor) -> Tensor:
