@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from adaafford.heatmaps import heatmap_writer, write_heatmap
 from adaafford.histories import History, ScanName, TriedOutcome, parse_json, read_history, scan_name, write_history
@@ -52,6 +53,17 @@ class SessionFiles:
     heatmap: Path | None
 
 
+class Seconds(StrictModel):
+    """Duration of the parts of a step, s."""
+
+    read: float
+    """The scans and the history."""
+    propose: float
+    """Adaptation and the choice of the action."""
+    write: float
+    """The heatmap and the history."""
+
+
 class Step(StrictModel):
     """The answer of a session, in the frame of the scan."""
 
@@ -59,6 +71,9 @@ class Step(StrictModel):
     """"try": a proposal of AIP, to learn more about the object; "act": the action that should succeed."""
     tries: int
     """Number of interactions with an outcome in the history."""
+    interaction: int = Field(ge=1)
+    """Number of the proposed interaction in the history, from 1. Give it back with its outcome, which is then counted
+    once, however often it is given."""
     point: Vector
     approach: Vector
     forward: Vector
@@ -68,13 +83,37 @@ class Step(StrictModel):
     """Duration of the step."""
 
 
-class Request(StrictModel):
-    """One input line of a session with `--follow`."""
+class Health(StrictModel):
+    """What a session with `--follow` says of itself."""
 
-    cloud: ScanName
+    health: Literal["ok"] = "ok"
+    steps: int
+    """Answered since the session was started."""
+    tries: int
+    """Number of interactions with an outcome, at the last step."""
+    last: Seconds | None
+    """Duration of the parts of the last step; None before the first."""
+
+
+class Request(StrictModel):
+    """One input line of a session with `--follow`: a scan, or a question after its health."""
+
+    cloud: ScanName = ""
     """A scan of the object in its present state."""
     outcome: TriedOutcome | None = None
     """The outcome of the last proposal; None if it was not executed."""
+    interaction: int | None = Field(None, ge=1)
+    """Number of the interaction that the outcome is of; None: the last proposal."""
+    health: bool = False
+    """Whether the line asks for `Health` alone."""
+
+    @model_validator(mode="after")
+    def _asks_for_one_thing(self) -> "Request":
+        if self.health is bool(self.cloud):
+            raise ValueError("needs a cloud, or health alone")
+        if self.interaction is not None and self.outcome is None:
+            raise ValueError("an interaction's number says what an outcome is of; give the outcome with it")
+        return self
 
     @classmethod
     def read(cls, line: bytes) -> "Request":
@@ -118,13 +157,24 @@ class Session:
         self._files, self._budget, self._seed, self._points = files, budget, seed, points
         self._up, self._camera, self._tell = up, camera, tell
         self._observations: dict[tuple[str, ScanFrame], Observation] = {}
+        self._steps = self._tries = 0
+        self._seconds: Seconds | None = None
 
-    def step(self, cloud: Path, outcome: TriedOutcome | None = None) -> Step:
+    @property
+    def health(self) -> Health:
+        """That the session lives, and how long its last step took."""
+        return Health(steps=self._steps, tries=self._tries, last=self._seconds)
+
+    def step(self, cloud: Path, outcome: TriedOutcome | None = None, interaction: int | None = None) -> Step:
         """Read a scan and the last outcome, and propose the next action.
+
+        A step that is repeated gives the same answer, and its outcome is counted once.
 
         Args:
             cloud: a scan of the object in its present state.
             outcome: of the last proposal; None if it was not executed.
+            interaction: number of the interaction that the outcome is of (`Step.interaction`); None: the last proposal,
+                unless the same outcome was told with the same scan before.
 
         Raises:
             UsageError: a file cannot be used, with the reason.
@@ -132,34 +182,63 @@ class Session:
         begun = time.perf_counter()
         name = self._name_of(cloud)
         history = self._history(name)
-        if outcome is not None:
+        if outcome is not None and not self._is_told(history, outcome, interaction, name):
             history = history.concluding(outcome)
         known = history.interactions_with(lambda each: self._observe(each.cloud, each.cloud_sha256, history.frame)[0])
         observation, sha256 = self._observe(name, None, history.frame)
         told = {id(each.observation) for each in known} | {id(observation)}
         self._observations = {key: value for key, value in self._observations.items() if id(value) in told}
+        read = time.perf_counter()
         rng = seeds.generator(self._seed, PURPOSE, len(known))
         action = AipProposer(self._adapter, rng, self._budget).propose(observation, known)
         do: Literal["try", "act"] = "act" if action is None else "try"
         if action is None:
             action = ExploitProposer(self._adapter, rng).propose(observation, known)
             assert action is not None, "an exploiter never stops"
-        if self._files.heatmap is not None:
-            heat = self._adapter.affordance(observation, known)
+        belief = float(self._adapter.score(observation, [action], known)[0])
+        heat = None if self._files.heatmap is None else self._adapter.affordance(observation, known)
+        chosen = time.perf_counter()
+        if self._files.heatmap is not None and heat is not None:
             places = history.frame.point_to_scan(observation.points.astype(np.float64))
             write_heatmap(self._files.heatmap, places, heat, observation.pixels)
         history = history.proposing(action, name, sha256)
         write_history(self._files.history, history)
-        proposed = history.interactions[-1]
+        proposed, ended = history.interactions[-1], time.perf_counter()
+        self._steps, self._tries = self._steps + 1, len(known)
+        self._seconds = Seconds(
+            read=round(read - begun, 3), propose=round(chosen - read, 3), write=round(ended - chosen, 3)
+        )
         return Step(
             do=do,
             tries=len(known),
+            interaction=len(known) + 1,
             point=proposed.point,
             approach=proposed.approach,
             forward=proposed.forward,
-            belief=round(float(self._adapter.score(observation, [action], known)[0]), 4),
-            seconds=round(time.perf_counter() - begun, 3),
+            belief=round(belief, 4),
+            seconds=round(ended - begun, 3),
         )
+
+    def _is_told(self, history: History, outcome: TriedOutcome, interaction: int | None, cloud: str) -> bool:
+        """Whether a history holds an outcome already, because the step is repeated."""
+        tried = history.tried
+        if interaction is None:
+            # The proposal after a step was made with the scan of that step.
+            pending = history.pending
+            return bool(tried) and pending is not None and pending.cloud == cloud and tried[-1].outcome == outcome
+        if interaction > len(tried):
+            if interaction > len(history.interactions):
+                raise UsageError(
+                    f"interaction {interaction} was not proposed; the history holds {len(history.interactions)}"
+                )
+            return False
+        if (told := tried[interaction - 1].outcome) != outcome:
+            assert told is not None, "an interaction has an outcome"
+            raise UsageError(
+                f"interaction {interaction} has an outcome already, motion {told.motion:g}, kind {told.kind.value}; "
+                "give that one again, or correct the history"
+            )
+        return True
 
     def _history(self, name: str) -> History:
         """The history that is there, or a new one around a first scan."""

@@ -36,6 +36,7 @@ COMMANDS = {
     "compare": "one table of the runs of several seeds, beside the paper's figures",
     "report": "print the results of a run again, and write its page again",
     "adapt": "propose the next interaction with a scanned object, and predict where it can be moved",
+    "rehearse": "a simulated robot that speaks the protocol of adapt --follow: test a program before hardware moves",
     "export-policy": "write a run's policy in half precision, with a model card",
     "calibrate": "fit a policy's probabilities to a few interactions with your own objects",
     "collect": "collect interactions into a store, without training",
@@ -57,13 +58,14 @@ NEEDS = {
     "compare": ("report",),
     "report": ("report",),
     "collect": ("collect",),
+    "rehearse": ("collect",),
     "curve": ("report",),
     "objects": ("collect",),
     "bench": ("collect",),
 }
 """Extras without which a command would fail, perhaps after hours; what only some of its uses need is not among them."""
 
-RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate")
+RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate", "rehearse")
 """Long work, with which the same command goes on after an interruption."""
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` shows more\n\n" + "\n".join(

@@ -350,6 +350,38 @@ def test_a_step_that_is_asked_for_again_is_the_same(policy_folder: Path, scan: P
     assert without_time(session(policy_folder, scan).step(scan)) == without_time(lost)
 
 
+def test_an_outcome_that_is_told_again_is_counted_once(policy_folder: Path, scan: Path) -> None:
+    later = scan.with_name("scan-2.npz")
+    np.savez(later, points=front(seed=2))
+    assert session(policy_folder, scan).step(scan).interaction == 1
+    for _ in range(2):  # By the scan that came with it.
+        step = session(policy_folder, scan).step(later, TriedOutcome(motion=0.2))
+        assert (step.tries, step.interaction) == (1, 2)
+    for outcome in (TriedOutcome(motion=0.0), TriedOutcome(motion=0.0)):  # By its number, with any scan.
+        assert session(policy_folder, scan).step(later, outcome, interaction=2).tries == 2
+    assert session(policy_folder, scan).step(later, TriedOutcome(motion=0.2), interaction=1).tries == 2
+    before = (scan.parent / "history.json").read_bytes()
+    with pytest.raises(UsageError, match=r"interaction 1 has an outcome already, motion 0\.2"):
+        session(policy_folder, scan).step(later, TriedOutcome(motion=0.3), interaction=1)
+    with pytest.raises(UsageError, match="interaction 4 was not proposed; the history holds 3"):
+        session(policy_folder, scan).step(later, TriedOutcome(motion=0.3), interaction=4)
+    assert (scan.parent / "history.json").read_bytes() == before
+
+
+def test_a_request_asks_for_one_thing(policy_folder: Path, scan: Path) -> None:
+    assert Request.read(b'{"health": true}').health
+    for line in (b"{}", b'{"cloud": "a.npz", "health": true}', b'{"cloud": "a.npz", "interaction": 1}'):
+        with pytest.raises(UsageError, match=r'write \{"cloud": "scan.ply"\}'):
+            Request.read(line)
+    live = session(policy_folder, scan)
+    assert (live.health.steps, live.health.last) == (0, None)
+    live.step(scan)
+    live.step(scan, TriedOutcome(motion=0.2))
+    assert (live.health.steps, live.health.tries) == (2, 1)
+    assert live.health.last is not None
+    assert live.health.last.propose > 0
+
+
 def test_files_carry_a_session_over_processes(policy_folder: Path, scan: Path, tmp_path: Path) -> None:
     """Begun anew before every step, a session says what one that lives on says."""
     other = tmp_path / "other" / scan.name

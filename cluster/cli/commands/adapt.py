@@ -13,6 +13,8 @@ from shared.io.text import plain
 from shared.types import OutcomeKind
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from adaafford.sessions import Session
 
 MAX_LINE_BYTES = 1 << 16
@@ -44,6 +46,8 @@ class AdaptCommand:
     """How that interaction ended, such as "ok", "no-contact" or "no-grasp"."""
     grasp_width: float | None = None
     """Opening of the two fingers together after they closed in that interaction, m."""
+    interaction: int | None = None
+    """Number of the interaction that --outcome is of, as an answer names it: a call that is repeated counts it once."""
     success: bool | None = None
     """Whether the part moved as intended; default: whether it moved by more than 0.01."""
     up: tuple[float, float, float] | None = None
@@ -70,6 +74,10 @@ def main(args: list[str]) -> int:
         raise UsageError(
             "--success, --kind and --grasp-width say how an outcome is meant; give --outcome MOTION with them"
         )
+    if command.interaction is not None and (command.outcome is None or command.interaction < 1):
+        raise UsageError(
+            f"--interaction {command.interaction}: the number, from 1, of the interaction that --outcome is of"
+        )
     if command.budget < 1:
         raise UsageError(f"--budget {command.budget}: at least one interaction is needed to adapt")
     if not MIN_SHOWN <= command.points <= MAX_SHOWN:
@@ -91,7 +99,7 @@ def main(args: list[str]) -> int:
         "grasp_width": command.grasp_width,
     }
     outcome = None if command.outcome is None else parse(TriedOutcome, told, "--outcome")
-    print(session.step(command.cloud, outcome).model_dump_json(), flush=True)
+    print(session.step(command.cloud, outcome, command.interaction).model_dump_json(), flush=True)
     if command.follow:
         _follow(session, command.cloud.parent)
     return 0
@@ -119,6 +127,10 @@ def _follow(session: "Session", folder: Path) -> None:
             if len(line) >= MAX_LINE_BYTES:
                 raise UsageError(f"a line of more than {MAX_LINE_BYTES} bytes; " + 'write {"cloud": "scan.ply"}')
             request = Request.read(line)
-            print(session.step(folder / request.cloud, request.outcome).model_dump_json(), flush=True)
+            if request.health:
+                answer: BaseModel = session.health
+            else:
+                answer = session.step(folder / request.cloud, request.outcome, request.interaction)
+            print(answer.model_dump_json(), flush=True)
         except AdaAffordError as error:
             print(json.dumps({"error": str(error)}), flush=True)

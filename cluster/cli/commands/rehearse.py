@@ -1,0 +1,160 @@
+"""`adaafford rehearse`: a simulated robot behind the protocol of `adaafford adapt --follow`."""
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from cluster.config.flags import parse_flags
+from shared.errors import AdaAffordError, UsageError
+from shared.extras import require
+from shared.io.files import make_folder
+
+if TYPE_CHECKING:
+    from adaafford.sessions import Request, Step
+    from cluster.evaluation.rehearsal import Executed, SimulatedRobot
+    from shared.policies.policy import Policy
+
+BUILT_IN_PER_CATEGORY = 4
+MAX_ROLLOUTS, MAX_NOISE = 1000, 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class RehearseCommand:
+    """A simulated robot in place of a real one: it gives scans and outcomes, and executes what is proposed.
+
+    Without --policy, standard input has the answers of `adaafford adapt --follow`, one a line, and standard output the
+    lines that `adapt --follow` reads: a scan with the outcome of the last interaction. A program that carries lines
+    between adapt and a robot is tested with this command in the robot's place. With --policy the session with that
+    policy is in this process, and the result is printed. The same command goes on after an interruption.
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """Folder for scans, state and, with --policy, history and heatmap; created if missing."""
+    task: str
+    """A task by name, or a TOML file that defines one."""
+    objects: Path | None = None
+    """A folder of objects in PartNet-Mobility's layout; default: procedural objects."""
+    policy: str | None = None
+    """The name of a bundled policy, a folder with weights.safetensors and policy.json, or a finished run."""
+    rollouts: int = 1
+    """With --policy: how many objects with freshly drawn hidden dynamics, each in a folder of its own, are tried."""
+    budget: int = 4
+    """With --policy: the most interactions before the final action."""
+    noise: float = 1.0
+    """Strength of the scans' errors: 0 is none, 1 a structured-light camera one metre from the object."""
+    marked: bool = True
+    """Whether scans mark the points of the part that is to be moved."""
+    seed: int = 1
+    """Everything random derives from it: objects, hidden dynamics, camera, states, noise."""
+
+
+def main(args: list[str]) -> int:
+    """Rehearse."""
+    command = parse_flags(RehearseCommand, args, "rehearse", RehearseCommand(tyro.MISSING, tyro.MISSING))
+    if not 1 <= command.rollouts <= MAX_ROLLOUTS:
+        raise UsageError(f"--rollouts {command.rollouts}: allowed are 1 to {MAX_ROLLOUTS}")
+    if command.policy is None and command.rollouts != 1:
+        raise UsageError(f"--rollouts {command.rollouts}: needs --policy; a robot has one object in front of it")
+    if not 0 <= command.noise <= MAX_NOISE:
+        raise UsageError(f"--noise {command.noise}: allowed are 0 to {MAX_NOISE:g}")
+    if not 1 <= command.budget <= 32:
+        raise UsageError(f"--budget {command.budget}: allowed are 1 to 32")
+    if command.seed < 0:
+        raise UsageError(f"--seed {command.seed}: needs a number that is not negative")
+    require("adaafford rehearse", "collect", without=("ray",))
+    if command.policy is None:
+        return _follow(next(_robots(command)))
+    from adaafford.pretrained import load_policy
+
+    policy = load_policy(command.policy)
+    ended = [_played(command, robot, policy) for robot in _robots(command)]
+    if len(ended) > 1:
+        print(_table(ended))
+    return 0
+
+
+def _robots(command: RehearseCommand) -> Iterator["SimulatedRobot"]:
+    """The robots of the command, each made when it is its turn."""
+    from cluster.cli.library import simulated
+    from cluster.config.objects import built_in_categories
+    from cluster.evaluation.rehearsal import Setting, SimulatedRobot
+    from collector.objects.procedural.writing import generate
+    from shared.tasks import task_of
+
+    make_folder(command.folder)
+    objects = command.objects
+    if objects is None:
+        objects = command.folder / "objects"
+        generate(objects, dict.fromkeys(built_in_categories(task_of(command.task), ()), BUILT_IN_PER_CATEGORY), 1)
+    for number, environment in enumerate(islice(simulated(objects, command.task, command.seed), command.rollouts)):
+        folder = command.folder if command.rollouts == 1 else command.folder / f"{number + 1:04d}"
+        make_folder(folder)
+        setting = Setting(
+            task=task_of(command.task).name,
+            object=environment.object.ref.id,
+            seed=command.seed,
+            number=number,
+            noise=command.noise,
+            marked=command.marked,
+        )
+        yield SimulatedRobot(environment, setting, folder)
+
+
+def _follow(robot: "SimulatedRobot") -> int:
+    """Execute the answers on standard input; print what a session reads."""
+    from adaafford.histories import parse_json
+    from adaafford.sessions import Step
+    from cluster.cli.commands.adapt import MAX_LINE_BYTES, lines_of
+
+    print(_line(robot.request), flush=True)
+    for line in lines_of(sys.stdin.buffer):
+        try:
+            if len(line) >= MAX_LINE_BYTES:
+                raise UsageError(f"a line of more than {MAX_LINE_BYTES} bytes; write an answer of adapt --follow")
+            print(_line(robot.execute(parse_json(Step, line, "", "write an answer of adapt --follow"))), flush=True)
+        except AdaAffordError as error:
+            print(json.dumps({"error": str(error)}), flush=True)
+    return 0
+
+
+def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy") -> "Executed":
+    """A whole session with one robot."""
+    from adaafford.sessions import Session, SessionFiles
+    from cluster.evaluation.rehearsal import rehearse
+
+    folder = robot.folder
+    files = SessionFiles(folder / "history.json", folder / "heatmap.ply")
+    session = Session(policy, files, command.budget, command.seed)
+
+    def tell(step: "Step", request: "Request") -> None:
+        assert request.outcome is not None, "an action has an outcome"
+        said = "success" if request.outcome.success else "failure"
+        print(
+            f"{folder.name} interaction {step.interaction} ({step.do}): belief {step.belief:.2f}, "
+            f"{request.outcome.kind.value}, {said}, motion {request.outcome.motion:.3f}",
+            flush=True,
+        )
+
+    return rehearse(robot, session, folder, tell)
+
+
+def _table(ended: list["Executed"]) -> str:
+    """How many final actions succeeded."""
+    from cluster.reporting.collecting import wilson
+
+    successes = sum(bool(one.outcome.success) for one in ended)
+    low, high = wilson(successes, len(ended))
+    return (
+        f"{successes} of {len(ended)} final actions succeeded: {100 * successes / len(ended):.0f}% "
+        f"[{100 * low:.0f}, {100 * high:.0f}]"
+    )
+
+
+def _line(request: "Request") -> str:
+    return request.model_dump_json(exclude_defaults=True)

@@ -1,0 +1,218 @@
+"""A rehearsal: a simulated object in place of a robot, behind the protocol of `adaafford adapt --follow`.
+
+The robot's side of the protocol reads the answers of a session (`Step`) and gives scans and outcomes (`Request`). Here
+the scans are rendered with the errors of a depth camera, and the actions executed in the simulator. The state is in a
+file beside the scans, which is written after each interaction, so a rehearsal can be ended at any moment.
+An answer that comes a second time is not executed again.
+"""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from adaafford.histories import TriedOutcome, parse_json
+from adaafford.scans import ScanFrame, action_at
+from adaafford.sessions import Request, Session, Step
+from collector.sim.depth_noise import noisy
+from collector.sim.environment import camera_for
+from collector.sim.simulator import SimEnvironment
+from shared import seeds
+from shared.config import CameraConfig, StrictModel
+from shared.errors import UsageError
+from shared.io.files import read_bounded, write_atomically
+from shared.types import Outcome, OutcomeKind
+
+STATE = "rehearsal.json"
+MAX_STATE_BYTES = 1 << 20
+BASE = (1.2, 0.0, 0.6)
+"""Where the object's origin is in the frame of the robot's base, m; z is up, and the object faces the base."""
+PURPOSE = "depth noise"
+
+
+class Setting(StrictModel):
+    """What defines a rehearsal.
+
+    Attributes:
+        task: name or definition.
+        object: id.
+        seed: everything random derives from it.
+        number: which of the objects that this seed gives, from 0.
+        noise: see `collector.sim.depth_noise`.
+        marked: whether scans say which points the policy may act on.
+    """
+
+    task: str
+    object: str
+    seed: int
+    number: int
+    noise: float
+    marked: bool
+
+
+class Executed(StrictModel):
+    """One interaction that was executed.
+
+    Attributes:
+        step: the answer that asked for it.
+        outcome: of it.
+        joint_positions: [parts], after it, at rest.
+    """
+
+    step: Step
+    outcome: TriedOutcome
+    joint_positions: tuple[float, ...]
+
+
+class State(StrictModel):
+    """The file `rehearsal.json`."""
+
+    format: Literal["adaafford-rehearsal"] = "adaafford-rehearsal"
+    schema_version: Literal[1] = 1
+    setting: Setting
+    start: tuple[float, ...]
+    """[parts], the joint positions before the first interaction."""
+    executed: tuple[Executed, ...] = Field((), max_length=64)
+
+
+class SimulatedRobot:
+    """A camera and a hand in front of one simulated object.
+
+    Args:
+        environment: at rest, with the object in view; the same for the same setting.
+        setting: of the rehearsal.
+        folder: for scans and state; what is there already is continued.
+
+    Attributes:
+        folder: the same.
+
+    Raises:
+        UsageError: the folder has the state of another rehearsal, or a file that is none.
+    """
+
+    def __init__(self, environment: SimEnvironment, setting: Setting, folder: Path) -> None:
+        self._environment, self.folder = environment, folder
+        self._config = CameraConfig()
+        observed = environment.observe()
+        self._pose = observed.world_from_camera
+        self._parts = np.unique(observed.part_ids[observed.movable])
+        path = folder / STATE
+        if path.exists():
+            self._state = parse_json(State, read_bounded(path, MAX_STATE_BYTES), f"{path}: ", "name another folder")
+            if self._state.setting != setting:
+                raise UsageError(f"{path}: is of another rehearsal; give the same settings, or another folder")
+        else:
+            self._state = State(setting=setting, start=tuple(environment.state().tolist()))
+        self._restore()
+        # Of a rehearsal that was ended before its first state was written, the first scan may be missing.
+        if not self._scan_path(len(self.executed)).exists() or not path.exists():
+            self._write_scan(len(self.executed))
+            self._write_state()
+
+    @property
+    def executed(self) -> tuple[Executed, ...]:
+        """The interactions that were executed, in order."""
+        return self._state.executed
+
+    @property
+    def request(self) -> Request:
+        """The scan of the object in its present state, and the outcome of the last interaction."""
+        done = len(self.executed)
+        if done == 0:
+            return Request(cloud=self._scan_path(0).name)
+        return Request(cloud=self._scan_path(done).name, outcome=self.executed[-1].outcome, interaction=done)
+
+    def execute(self, step: Step) -> Request:
+        """Execute the action of an answer, and look at the object again.
+
+        Raises:
+            UsageError: the answer is not the next one, or differs from the one that was executed under its number.
+        """
+        done = len(self.executed)
+        if done and step.interaction == done and _action_of(step) == _action_of(self.executed[-1].step):
+            return self.request  # The answer came a second time.
+        if step.interaction != done + 1:
+            raise UsageError(f"interaction {step.interaction} cannot follow {done} executed ones")
+        outcome = self._try(step)
+        self._environment.observe()  # Waits until the object is at rest.
+        after = tuple(self._environment.state().tolist())
+        executed = Executed(step=step, outcome=outcome, joint_positions=after)
+        self._write_scan(done + 1)
+        self._state = self._state.model_copy(update={"executed": (*self.executed, executed)})
+        self._write_state()
+        return self.request
+
+    def _try(self, step: Step) -> TriedOutcome:
+        """Execute an action that was chosen on a noisy scan, at the nearest point that is seen."""
+        observed = self._environment.observe()
+        frame = ScanFrame(camera=(0.0, 0.0, 0.0), origin=BASE)
+        try:
+            action = action_at(observed, frame, step.point, step.approach, step.forward)
+        except UsageError:
+            return TriedOutcome(motion=0.0, success=False, kind=OutcomeKind.NO_CONTACT)  # It points into the air.
+        return _told(self._environment.execute(action))
+
+    def _restore(self) -> None:
+        positions = self.executed[-1].joint_positions if self.executed else self._state.start
+        if len(positions) != len(self._environment.state()):
+            raise UsageError(f"{self.folder / STATE}: is of another object; name another folder")
+        if self.executed:
+            self._environment.restore(np.array(positions))
+
+    def _scan_path(self, number: int) -> Path:
+        return self.folder / f"scan-{number + 1}.npz"
+
+    def _write_scan(self, number: int) -> None:
+        camera = camera_for(self._environment.object, self._pose, self._config)
+        rng = seeds.generator(self._state.setting.seed, PURPOSE, number)
+        place = self._pose[:3, 3]
+        image = noisy(
+            camera.capture(self._environment.state()), self._config.image_size, place, self._state.setting.noise, rng
+        )
+        arrays: dict[str, Any] = {"points": (image.points + BASE).astype(np.float32), "camera": place + BASE}
+        if self._state.setting.marked:
+            arrays["movable"] = np.isin(image.bodies, self._parts)
+        packed = io.BytesIO()
+        np.savez_compressed(packed, **arrays)
+        write_atomically(self._scan_path(number), packed.getvalue())
+
+    def _write_state(self) -> None:
+        write_atomically(self.folder / STATE, self._state.model_dump_json(indent=2).encode() + b"\n")
+
+
+def rehearse(robot: SimulatedRobot, session: Session, folder: Path, tell: Callable[[Step, Request], None]) -> Executed:
+    """Let a session act on a simulated robot until its final action was executed.
+
+    Args:
+        robot: with the object.
+        session: with the policy.
+        folder: of the scans.
+        tell: receives each answer and what came of it.
+
+    Returns:
+        The final action with its outcome, which the history has as well.
+    """
+    while True:
+        request = robot.request
+        last = robot.executed[-1] if robot.executed else None
+        step = session.step(folder / request.cloud, request.outcome, request.interaction)
+        if last is not None and last.step.do == "act":
+            return last
+        tell(step, robot.execute(step))
+
+
+def _action_of(step: Step) -> tuple[object, ...]:
+    return step.point, step.approach, step.forward
+
+
+def _told(outcome: Outcome) -> TriedOutcome:
+    """An outcome as a robot says it."""
+    return TriedOutcome(
+        motion=round(min(outcome.motion, 100.0), 6) if np.isfinite(outcome.motion) else 0.0,
+        success=outcome.success,
+        kind=outcome.kind,
+        grasp_width=round(outcome.grasp_opening, 6) if np.isfinite(outcome.grasp_opening) else None,
+    )

@@ -1,0 +1,209 @@
+"""Rehearsals: a simulated robot behind the protocol of `adapt --follow`; ended at any moment, it counts all once."""
+
+import json
+from collections.abc import Callable, Iterator
+from itertools import count, islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adaafford.histories import TriedOutcome, read_history
+from adaafford.scans import read_scan
+from adaafford.sessions import Session, SessionFiles, Step
+from cluster.cli.library import simulated
+from cluster.cli.main import run as adaafford
+from cluster.evaluation import rehearsal
+from cluster.evaluation.rehearsal import STATE, Executed, Setting, SimulatedRobot
+from collector.objects.procedural.writing import generate
+from collector.sim.depth_noise import LEVEL_M, noisy
+from collector.sim.environment import camera_for
+from shared.config import CameraConfig
+from shared.errors import UsageError
+from shared.types import OutcomeKind
+from tests.support.small_policies import policy_with_all
+
+TASK = "pull-closed-door"
+
+
+@pytest.fixture(scope="session")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("objects")
+    generate(folder, {"StorageFurniture": 2}, 1)
+    return folder
+
+
+@pytest.fixture
+def make_robot(objects: Path, tmp_path: Path) -> Callable[[], SimulatedRobot]:
+    def make(**changes: object) -> SimulatedRobot:
+        environment = next(simulated(objects, TASK, seed=1))
+        told = {"task": TASK, "object": environment.object.ref.id, "seed": 1, "number": 0, "noise": 1.0, "marked": True}
+        return SimulatedRobot(environment, Setting.model_validate(told | changes), tmp_path)
+
+    return make
+
+
+def a_step(robot: SimulatedRobot, interaction: int) -> Step:
+    """A proposal at a movable point of the last scan, head on."""
+    scan = read_scan(robot.folder / robot.request.cloud)
+    assert scan.movable is not None
+    x, y, z = np.median(scan.points[scan.movable], axis=0).tolist()
+    return Step(
+        do="try", tries=interaction - 1, interaction=interaction, point=(x, y, z), approach=(1, 0, 0),
+        forward=(0, 0, 1), belief=0.5, seconds=0.0,
+    )  # fmt: skip
+
+
+def test_an_answer_that_comes_again_is_executed_once(make_robot: Callable[..., SimulatedRobot]) -> None:
+    robot = make_robot()
+    assert robot.request.outcome is None
+    step = a_step(robot, 1)
+    told = robot.execute(step)
+    assert (told.interaction, told.cloud) == (1, "scan-2.npz")
+    assert robot.execute(step) == told
+    assert make_robot().execute(step) == told, "in another process, too"
+    with pytest.raises(UsageError, match="interaction 3 cannot follow 1"):
+        robot.execute(step.model_copy(update={"interaction": 3}))
+    with pytest.raises(UsageError, match="interaction 1 cannot follow 1"):
+        robot.execute(step.model_copy(update={"point": (9.0, 9.0, 9.0)}))
+    assert len(robot.executed) == 1
+
+
+def test_what_points_into_the_air_touches_nothing(make_robot: Callable[..., SimulatedRobot]) -> None:
+    robot = make_robot()
+    told = robot.execute(a_step(robot, 1).model_copy(update={"point": (9.0, 9.0, 9.0)}))
+    assert told.outcome == TriedOutcome(motion=0.0, success=False, kind=OutcomeKind.NO_CONTACT)
+
+
+def test_another_rehearsal_is_not_continued(make_robot: Callable[..., SimulatedRobot]) -> None:
+    robot = make_robot()
+    with pytest.raises(UsageError, match="another rehearsal"):
+        make_robot(noise=0.0)
+    (robot.folder / STATE).write_text("{")
+    with pytest.raises(UsageError, match="name another folder"):
+        make_robot()
+
+
+class Killed(BaseException):
+    """The process ended."""
+
+
+def killing(at: int) -> Callable[[Path, bytes], None]:
+    """A writer that is ended at a write: before the file is there where `at` is even, after it otherwise."""
+    from shared.io.files import write_atomically
+
+    writes = count()
+
+    def write(path: Path, data: bytes) -> None:
+        now = next(writes) == at // 2
+        if now and at % 2 == 0:
+            raise Killed
+        write_atomically(path, data)
+        if now:
+            raise Killed
+
+    return write
+
+
+@pytest.mark.slow
+def test_a_rehearsal_that_is_ended_at_every_write_counts_everything_once(
+    make_robot: Callable[..., SimulatedRobot], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def played() -> Executed:
+        robot = make_robot()
+        session = Session(policy, SessionFiles(tmp_path / "history.json", None), budget=1, points=256)
+        return rehearsal.rehearse(robot, session, tmp_path, lambda step, request: None)
+
+    policy, kills = policy_with_all(), 0
+    for at in count():
+        for path in tmp_path.iterdir():
+            path.unlink()
+        with monkeypatch.context() as patched:
+            write = killing(at)
+            patched.setattr(rehearsal, "write_atomically", write)
+            patched.setattr("adaafford.histories.write_atomically", write)
+            try:
+                played()
+                break
+            except Killed:
+                kills += 1
+        last = played()
+        assert played() == last, "a finished rehearsal stays as it is"
+        state = rehearsal.State.model_validate_json((tmp_path / STATE).read_bytes())
+        tried = read_history(tmp_path / "history.json").tried
+        assert [one.step.interaction for one in state.executed] == list(range(1, len(state.executed) + 1))
+        assert [one.outcome for one in state.executed] == [one.outcome for one in tried]
+        assert last == state.executed[-1]
+        assert last.step.do == "act"
+    assert kills >= 12
+
+
+def test_lines_go_between_session_and_robot(
+    objects: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What `rehearse` prints is what `adapt --follow` reads, and the other way round."""
+    session = Session(policy_with_all(), SessionFiles(tmp_path / "robot" / "history.json", None), budget=1, points=256)
+
+    def answers(stream: object) -> Iterator[bytes]:
+        yield b'{"do": "dance"}\n'
+        for _ in range(2):
+            request = json.loads(capsys.readouterr().out.splitlines()[0 if not said else -1])
+            said.append(request)
+            yield (
+                session.step(
+                    tmp_path / "robot" / request["cloud"],
+                    TriedOutcome.model_validate(request["outcome"]) if "outcome" in request else None,
+                    request.get("interaction"),
+                )
+                .model_dump_json()
+                .encode()
+            )
+
+    said: list[dict[str, object]] = []
+    monkeypatch.setattr("cluster.cli.commands.adapt.lines_of", answers)
+    assert adaafford(["rehearse", str(tmp_path / "robot"), "--task", TASK, "--objects", str(objects)]) == 0
+    assert [request["cloud"] for request in said] == ["scan-1.npz", "scan-2.npz"]
+    assert said[1]["interaction"] == 1
+    assert json.loads(capsys.readouterr().out)["interaction"] == 2
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (["--noise", "-1"], "allowed are 0 to 10"),
+        (["--rollouts", "2"], "needs --policy"),
+        (["--budget", "0"], "allowed are 1 to 32"),
+        (["--seed", "-1"], "not negative"),
+        (["--task", "juggle"], "juggle"),
+        (["--objects", "/nowhere"], "/nowhere"),
+    ],
+)
+def test_bad_input_is_one_line(
+    flags: list[str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert adaafford(["rehearse", str(tmp_path / "new"), "--task", TASK, *flags]) == 2
+    line = capsys.readouterr().err
+    assert expected in line
+    assert line.count("\n") == 1
+
+
+# The errors of a depth camera.
+
+
+def test_noise_has_the_deviation_that_was_measured_and_leaves_pixels_out_at_edges(objects: Path) -> None:
+    (environment,) = islice(simulated(objects, TASK, seed=1), 1)
+    config, pose = CameraConfig(), environment.observe().world_from_camera
+    image = camera_for(environment.object, pose, config).capture(environment.state())
+    place = pose[:3, 3]
+    assert noisy(image, config.image_size, place, 0.0, np.random.default_rng(1)) is image
+    seen = noisy(image, config.image_size, place, 1.0, np.random.default_rng(1))
+    again = noisy(image, config.image_size, place, 1.0, np.random.default_rng(1))
+    np.testing.assert_array_equal(seen.points, again.points)
+    assert 0.8 < len(seen.pixels) / len(image.pixels) < 1
+    true = dict(zip(image.pixels.tolist(), image.depths.tolist(), strict=True))
+    error = seen.depths - np.array([true[pixel] for pixel in seen.pixels.tolist()])
+    # The quartiles of a normal distribution, which the few mixed pixels hardly move.
+    deviation = np.subtract(*np.quantile(error, [0.75, 0.25])) / 1.349
+    assert LEVEL_M < deviation < 1.3 * LEVEL_M
+    rays = (seen.points - place) / seen.depths[:, None]
+    np.testing.assert_allclose(rays @ pose[:3, 0], 1.0, atol=1e-9)
