@@ -8,6 +8,7 @@ An answer that comes a second time is not executed again.
 
 import io
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -118,6 +119,13 @@ class SimulatedRobot:
         return self._state.executed
 
     @property
+    def moved(self) -> float:
+        """How far the joint of the part that is to be moved is from where it was at first, rad or m."""
+        joint = int(self._parts[0]) - 1
+        now = self.executed[-1].joint_positions if self.executed else self._state.start
+        return abs(now[joint] - self._state.start[joint])
+
+    @property
     def request(self) -> Request:
         """The scan of the object in its present state, and the outcome of the last interaction."""
         done = len(self.executed)
@@ -183,24 +191,45 @@ class SimulatedRobot:
         write_atomically(self.folder / STATE, self._state.model_dump_json(indent=2).encode() + b"\n")
 
 
-def rehearse(robot: SimulatedRobot, session: Session, folder: Path, tell: Callable[[Step, Request], None]) -> Executed:
-    """Let a session act on a simulated robot until its final action was executed.
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """How far a part is to be moved.
+
+    Attributes:
+        motion: of its joint, either way from where it was at first, rad or m.
+        within: the most interactions.
+        repeat: whether the first final action is executed again and again, instead of one that is proposed each time.
+    """
+
+    motion: float
+    within: int
+    repeat: bool = False
+
+
+def rehearse(
+    robot: SimulatedRobot, session: Session, tell: Callable[[Step, Request], None], goal: Goal | None = None
+) -> bool:
+    """Let a session act on a simulated robot until its final action was executed, or a goal was reached.
 
     Args:
         robot: with the object.
         session: with the policy.
-        folder: of the scans.
         tell: receives each answer and what came of it.
+        goal: what is to be reached by several final actions.
 
     Returns:
-        The final action with its outcome, which the history has as well.
+        Whether the final action succeeded, or the goal was reached; the history has all outcomes.
     """
     while True:
-        request = robot.request
-        last = robot.executed[-1] if robot.executed else None
-        step = session.step(folder / request.cloud, request.outcome, request.interaction)
-        if last is not None and last.step.do == "act":
-            return last
+        request, executed = robot.request, robot.executed
+        step = session.step(robot.folder / request.cloud, request.outcome, request.interaction)
+        acts = [one.step for one in executed if one.step.do == "act"]
+        if goal is None and acts:
+            return bool(executed[-1].outcome.success)
+        if goal is not None and (robot.moved >= goal.motion or len(executed) >= goal.within):
+            return robot.moved >= goal.motion
+        if goal is not None and goal.repeat and acts:
+            step = acts[0].model_copy(update={"interaction": step.interaction, "tries": step.tries})
         tell(step, robot.execute(step))
 
 

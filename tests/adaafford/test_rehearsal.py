@@ -112,7 +112,9 @@ def test_a_rehearsal_that_is_ended_at_every_write_counts_everything_once(
     def played() -> Executed:
         robot = make_robot()
         session = Session(policy, SessionFiles(tmp_path / "history.json", None), budget=1, points=256)
-        return rehearsal.rehearse(robot, session, tmp_path, lambda step, request: None)
+        succeeded = rehearsal.rehearse(robot, session, lambda step, request: None)
+        assert succeeded is robot.executed[-1].outcome.success
+        return robot.executed[-1]
 
     policy, kills = policy_with_all(), 0
     for at in count():
@@ -136,6 +138,22 @@ def test_a_rehearsal_that_is_ended_at_every_write_counts_everything_once(
         assert last == state.executed[-1]
         assert last.step.do == "act"
     assert kills >= 12
+
+
+def test_a_goal_is_pursued_by_several_actions(make_robot: Callable[..., SimulatedRobot], tmp_path: Path) -> None:
+    policy = policy_with_all()
+    for repeat in (False, True):
+        robot = make_robot()
+        session = Session(policy, SessionFiles(robot.folder / "history.json", None), budget=1, points=256)
+        assert not rehearsal.rehearse(robot, session, lambda *_: None, rehearsal.Goal(50.0, within=4, repeat=repeat))
+        assert [one.step.do for one in robot.executed] == ["try", "act", "act", "act"]
+        points = {one.step.point for one in robot.executed[1:]}
+        assert (len(points) == 1) is repeat
+        before, after = robot._state.start, robot.executed[-1].joint_positions
+        assert robot.moved in [abs(a - b) for a, b in zip(after, before, strict=True)]
+        assert rehearsal.rehearse(robot, session, lambda *_: None, rehearsal.Goal(0.0, within=4))
+        for path in tmp_path.iterdir():
+            path.unlink()
 
 
 def test_lines_go_between_session_and_robot(
@@ -174,6 +192,10 @@ def test_lines_go_between_session_and_robot(
         (["--rollouts", "2"], "needs --policy"),
         (["--budget", "0"], "allowed are 1 to 32"),
         (["--seed", "-1"], "not negative"),
+        (["--goal", "0.5"], "needs --policy"),
+        (["--policy", "push-faucet", "--goal", "-1"], "more than 0"),
+        (["--repeat"], "give one"),
+        (["--budget", "6"], "allowed are 7"),
         (["--task", "juggle"], "juggle"),
         (["--objects", "/nowhere"], "/nowhere"),
     ],

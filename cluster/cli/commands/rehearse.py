@@ -17,7 +17,7 @@ from shared.io.files import make_folder
 
 if TYPE_CHECKING:
     from adaafford.sessions import Request, Step
-    from cluster.evaluation.rehearsal import Executed, SimulatedRobot
+    from cluster.evaluation.rehearsal import SimulatedRobot
     from shared.policies.policy import Policy
 
 BUILT_IN_PER_CATEGORY = 4
@@ -46,6 +46,12 @@ class RehearseCommand:
     """With --policy: how many objects with freshly drawn hidden dynamics, each in a folder of its own, are tried."""
     budget: int = 4
     """With --policy: the most interactions before the final action."""
+    goal: float | None = None
+    """With --policy: go on until the part has moved so far from where it was at first, rad or m."""
+    within: int = 6
+    """With --goal: the most interactions, those of --budget included."""
+    repeat: bool = False
+    """With --goal: execute the first final action again and again, for comparison."""
     noise: float = 1.0
     """Strength of the scans' errors: 0 is none, 1 a structured-light camera one metre from the object."""
     marked: bool = True
@@ -56,6 +62,8 @@ class RehearseCommand:
 
 def main(args: list[str]) -> int:
     """Rehearse."""
+    from adaafford.histories import MAX_TRIES
+
     command = parse_flags(RehearseCommand, args, "rehearse", RehearseCommand(tyro.MISSING, tyro.MISSING))
     if not 1 <= command.rollouts <= MAX_ROLLOUTS:
         raise UsageError(f"--rollouts {command.rollouts}: allowed are 1 to {MAX_ROLLOUTS}")
@@ -65,6 +73,14 @@ def main(args: list[str]) -> int:
         raise UsageError(f"--noise {command.noise}: allowed are 0 to {MAX_NOISE:g}")
     if not 1 <= command.budget <= 32:
         raise UsageError(f"--budget {command.budget}: allowed are 1 to 32")
+    if command.policy is None and command.goal is not None:
+        raise UsageError(f"--goal {command.goal}: needs --policy, which chooses the actions")
+    if command.goal is not None and not 0 < command.goal <= 100:
+        raise UsageError(f"--goal {command.goal}: allowed are more than 0 and at most 100, rad or m")
+    if command.repeat and command.goal is None:
+        raise UsageError("--repeat: says how a --goal is pursued; give one")
+    if not command.budget < command.within <= MAX_TRIES:
+        raise UsageError(f"--within {command.within}: allowed are {command.budget + 1}, after --budget, to {MAX_TRIES}")
     if command.seed < 0:
         raise UsageError(f"--seed {command.seed}: needs a number that is not negative")
     require("adaafford rehearse", "collect", without=("ray",))
@@ -74,8 +90,7 @@ def main(args: list[str]) -> int:
 
     policy = load_policy(command.policy)
     ended = [_played(command, robot, policy) for robot in _robots(command)]
-    if len(ended) > 1:
-        print(_table(ended))
+    print(_summary(command, ended))
     return 0
 
 
@@ -123,10 +138,10 @@ def _follow(robot: "SimulatedRobot") -> int:
     return 0
 
 
-def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy") -> "Executed":
-    """A whole session with one robot."""
+def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy") -> bool:
+    """A whole session with one robot; whether it succeeded."""
     from adaafford.sessions import Session, SessionFiles
-    from cluster.evaluation.rehearsal import rehearse
+    from cluster.evaluation.rehearsal import Goal, rehearse
 
     folder = robot.folder
     files = SessionFiles(folder / "history.json", folder / "heatmap.ply")
@@ -141,19 +156,18 @@ def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy")
             flush=True,
         )
 
-    return rehearse(robot, session, folder, tell)
+    goal = None if command.goal is None else Goal(command.goal, command.within, command.repeat)
+    return rehearse(robot, session, tell, goal)
 
 
-def _table(ended: list["Executed"]) -> str:
-    """How many final actions succeeded."""
+def _summary(command: RehearseCommand, ended: list[bool]) -> str:
+    """How many rollouts succeeded, with a 95% interval."""
     from cluster.reporting.collecting import wilson
 
-    successes = sum(bool(one.outcome.success) for one in ended)
-    low, high = wilson(successes, len(ended))
-    return (
-        f"{successes} of {len(ended)} final actions succeeded: {100 * successes / len(ended):.0f}% "
-        f"[{100 * low:.0f}, {100 * high:.0f}]"
-    )
+    what = "final actions succeeded" if command.goal is None else f"parts moved by {command.goal:g}"
+    low, high = wilson(sum(ended), len(ended))
+    share = sum(ended) / len(ended)
+    return f"{sum(ended)} of {len(ended)} {what}: {100 * share:.0f}% [{100 * low:.0f}, {100 * high:.0f}]"
 
 
 def _line(request: "Request") -> str:
