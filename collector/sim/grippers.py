@@ -22,7 +22,7 @@ def _corners(x: float, y_low: float, y_high: float, z: float) -> list[tuple[floa
     return [(s * x, y, z) for s in (-1.0, 1.0) for y in (y_low, y_high)]
 
 
-def _panda() -> TwoFingers:
+def panda_shape() -> TwoFingers:
     """The Franka Panda hand. Its flange, below z = 0, is round with the radius of the wrist."""
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     flange = [(0.0316 * np.cos(a), 0.0316 * np.sin(a), -0.026) for a in angles]
@@ -38,4 +38,4 @@ def _panda() -> TwoFingers:
     return TwoFingers((convex(flange + body + top),), (convex(finger),), 0.0584, 0.04, 0.73, 0.015)
 
 
-GRIPPERS = Registry("gripper", GripperSpec, {"panda": two_fingered(_panda())})
+GRIPPERS = Registry("gripper", GripperSpec, {"panda": two_fingered(panda_shape())})
