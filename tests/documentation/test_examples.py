@@ -61,6 +61,13 @@ def test_a_store_is_looked_at_and_trained_from_by_a_network_of_ones_own(place: P
 
 
 @pytest.mark.slow
+def test_a_program_carries_lines_between_a_session_and_a_robot_and_can_be_run_again(place: Path) -> None:
+    interactions = example(place, "robot.py", "robot").splitlines()
+    assert [line[:14] for line in interactions] == ["interaction 1:", "interaction 2:", "the action tha"]
+    assert example(place, "robot.py", "robot").splitlines() == interactions[2:]
+
+
+@pytest.mark.slow
 def test_an_object_is_written_and_collected_on(place: Path) -> None:
     printed = example(place, "own_object.py", "mine", "on-mine")
     assert printed.count("my-turnstile, bar: ") == 16
