@@ -10,6 +10,7 @@ For a robot, implement `Environment` with its camera and arm, and let the policy
 
 `open_store` reads collected data: tables, clouds, and by `InteractionDataset` samples for PyTorch.
 `collect` and `train` are the commands of these names; `simulated` gives simulated objects for tests of a policy.
+`gymnasium.make("adaafford/PullClosedDoor-v0")` and other ids give the same objects as Gymnasium environments.
 Collection and simulation need `pip install 'adaafford[collect]'`, and import these packages only when they are used.
 """
 
@@ -17,16 +18,18 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
+from adaafford.gymnasium_ids import register_when_imported
 from adaafford.packages import require_own_packages
 
 require_own_packages()
+register_when_imported()
 __version__ = version("adaafford")
 
 if TYPE_CHECKING:
     from adaafford.heatmaps import write_heatmap
     from adaafford.pretrained import load_policy
     from adaafford.scans import ScanFrame, checked_scan, doubtful_up, observation_of, read_scan
-    from cluster.cli.library import collect, ray_source, simulated, train
+    from cluster.cli.library import collect, from_gymnasium, ray_source, simulated, train
     from shared.errors import AdaAffordError
     from shared.policies.adaptation import Adapter
     from shared.policies.policy import Policy
@@ -50,7 +53,7 @@ else:
         "adaafford.heatmaps": ("write_heatmap",),
         "adaafford.pretrained": ("load_policy",),
         "adaafford.scans": ("ScanFrame", "checked_scan", "doubtful_up", "observation_of", "read_scan"),
-        "cluster.cli.library": ("collect", "ray_source", "simulated", "train"),
+        "cluster.cli.library": ("collect", "from_gymnasium", "ray_source", "simulated", "train"),
         "shared.policies.adaptation": ("Adapter",),
         "shared.errors": ("AdaAffordError",),
         "shared.policies.policy": ("Policy",),
@@ -98,6 +101,7 @@ __all__ = [
     "checked_scan",
     "collect",
     "doubtful_up",
+    "from_gymnasium",
     "load_policy",
     "observation_of",
     "open_store",

@@ -1,5 +1,7 @@
 """Rollouts: one object, one draw of hidden dynamics, one camera, and a sequence of interactions."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from collector.domain_randomisation import Draw, draw_rollout
@@ -31,6 +33,38 @@ def run_rollout(
         make_proposer: makes the proposers of the plan.
         clock: sums wall time by stage.
     """
+    start = begin(plan, index, target, clock)
+    if isinstance(start, RolloutStatus):
+        return _record(plan, draw_rollout(plan, index, TRIES - 1), start, None)
+    recorder = Recorder(start.environment, plan.policy_version, clock)
+    if plan.setting.kind == "evaluation":
+        evaluate(plan, index, recorder, make_proposer)
+    else:
+        collect(plan, index, recorder, start.states, make_proposer)
+    return _record(plan, start.draw, RolloutStatus.OK, recorder)
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """A rollout before its first interaction.
+
+    Attributes:
+        draw: its object, hidden dynamics and camera.
+        environment: the object is at rest and shows a part that the task may act on.
+        states: draws its further start states.
+    """
+
+    draw: Draw
+    environment: SimEnvironment
+    states: np.random.Generator
+
+
+def begin(plan: Plan, index: int, target: ArticulatedObject, clock: StageClock) -> Start | RolloutStatus:
+    """Draw cameras and states until a rollout can begin; arguments as for `run_rollout`.
+
+    Returns:
+        The start, or why there is none.
+    """
     rested = False
     for attempt in range(TRIES):
         draw = draw_rollout(plan, index, attempt)
@@ -39,15 +73,9 @@ def run_rollout(
         if not environment.reset(states):
             continue
         rested = True
-        if not environment.shows_a_target():
-            continue
-        recorder = Recorder(environment, plan.policy_version, clock)
-        if plan.setting.kind == "evaluation":
-            evaluate(plan, index, recorder, make_proposer)
-        else:
-            collect(plan, index, recorder, states, make_proposer)
-        return _record(plan, draw, RolloutStatus.OK, recorder)
-    return _record(plan, draw, RolloutStatus.NOTHING_TO_ACT_ON if rested else RolloutStatus.NEVER_AT_REST, None)
+        if environment.shows_a_target():
+            return Start(draw, environment, states)
+    return RolloutStatus.NOTHING_TO_ACT_ON if rested else RolloutStatus.NEVER_AT_REST
 
 
 def draws_at_rest(plan: Plan, index: int, target: ArticulatedObject) -> int:

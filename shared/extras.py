@@ -9,6 +9,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
     "report": ("matplotlib", "plotly", "jinja2"),
     "import": ("trimesh", "pycollada", "mujoco"),
+    "gym": ("gymnasium",),
     "ray-data": ("ray", "pandas"),
     "wandb": ("wandb",),
     "mlflow": ("mlflow",),

@@ -1,7 +1,6 @@
 """What a Python program calls instead of the command line; `adaafford` has these names."""
 
 from collections.abc import Iterator, Sequence
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +15,12 @@ from shared.store.selection import Condition
 from shared.tasks import task_of
 
 if TYPE_CHECKING:
+    import gymnasium
+
     from cluster.cli.ray_source import RaySource
+    from collector.gym.environment import FromGymnasium
     from collector.sim.simulator import SimEnvironment
     from learner.stages.jobs import StageName
-
-EMPTY_TURNS = 4
-"""Turns over all objects without one that can be acted on, after which there is none."""
 
 
 def collect(store: str | Path, **settings: Any) -> Store:
@@ -89,29 +88,32 @@ def simulated(objects: str | Path, task: str, seed: int = 1) -> Iterator["SimEnv
         UsageError: there is no such task, or no object that it applies to comes to rest in view of the camera.
     """
     require("adaafford.simulated", "collect", without=("ray",))
-    from collector.domain_randomisation import draw_rollout, object_of
-    from collector.objects.catalogue import for_task, load_ref, scan
-    from collector.rollout import make_environment
-    from collector.setting import make_setting
-    from collector.stopwatch import StageClock
-    from shared import seeds
-    from shared.plan import Plan
+    from collector.simulated_objects import SimulatedObjects
 
-    chosen, folder = task_of(task), Path(objects)
-    refs = tuple(entry.ref for entry in for_task(scan(folder), chosen).usable)
-    if not refs:
-        raise UsageError(f"{folder}: no object that '{task}' applies to; look at `adaafford objects check`")
-    plan = Plan(setting=make_setting(chosen, CollectionConfig(), seed=seed, objects=refs))
-    last = 0
-    for index in count():
-        target = load_ref(folder, object_of(plan, index), plan.setting.collection.collision)
-        environment = make_environment(plan, draw_rollout(plan, index), target, StageClock())
-        states = seeds.generator(seed, f"states/{plan.key}", index, 0)
-        if environment.reset(states) and environment.shows_a_target():
-            last = index
-            yield environment
-        elif index - last >= EMPTY_TURNS * len(refs):
-            raise UsageError(f"{folder}: no object comes to rest in view; look at `adaafford objects check --settle`")
+    found = SimulatedObjects(Path(objects), task_of(task), CollectionConfig())
+    plan, first = found.plan(seed), 0
+    while True:
+        start = found.start(plan, first)
+        first = start.draw.index + 1
+        yield start.environment
+
+
+def from_gymnasium(
+    env: "gymnasium.Env[Any, Any]", seed: int | None = None, options: dict[str, Any] | None = None
+) -> "FromGymnasium":
+    """A Gymnasium environment of this package as an `Environment`, in which proposers can act.
+
+    Args:
+        env: from `gymnasium.make("adaafford/...")`.
+        seed: of the first `reset`.
+        options: likewise.
+
+    Raises:
+        UsageError: Gymnasium or the simulator is not installed, or the environment cannot be reset in this way.
+    """
+    from collector.gym.environment import FromGymnasium
+
+    return FromGymnasium(env, seed, options)
 
 
 def ray_source(

@@ -94,6 +94,13 @@ def test_two_methods_are_compared(place: Path) -> None:
 
 
 @pytest.mark.slow
+def test_two_agents_act_through_gymnasium(place: Path) -> None:
+    printed = example(place, "agents.py", "objects", "2")
+    assert printed.count("of 4 succeed") == 2
+    assert printed.count("interactions it moves by") == 2
+
+
+@pytest.mark.slow
 def test_an_affordance_is_drawn(place: Path) -> None:
     example(place, "heatmap.py", "objects", "heatmap.png")
     assert (place / "heatmap.png").read_bytes().startswith(b"\x89PNG")
