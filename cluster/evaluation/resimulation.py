@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from collector.objects.catalogue import load_ref
-from collector.sim.scene import Scene
+from collector.sim.restoration import refuse_other_simulators, restored
 from collector.sim.trial import Trial
-from shared.config import SAPIEN
-from shared.errors import StoreError, UsageError
+from shared.errors import StoreError
 from shared.primitives import PRIMITIVES
 from shared.records import InteractionRecord, RolloutRecord
 from shared.seeds import generator
 from shared.store import Store
-from shared.types import Direction, Float, Outcome, OutcomeKind
+from shared.types import Float, Outcome, OutcomeKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +78,7 @@ def resimulate(
         ObjectError: an object is missing, or its files are others.
         UsageError: another simulator made the store.
     """
-    if (simulator := store.setting.collection.simulator) != SAPIEN:
-        raise UsageError(f"{store.where}: made with the simulator '{simulator}'; only SAPIEN executes rows again")
+    refuse_other_simulators(store.setting.collection)
     replayed = []
     for shard, chosen in _chosen(store, rows, seed).items():
         records = {record.index: record for record in store.read_rollouts(shard)}
@@ -107,22 +105,5 @@ def _chosen(store: Store, rows: int, seed: int) -> dict[str, list[tuple[int, int
 
 def _again(store: Store, objects: Path, record: RolloutRecord, row: InteractionRecord) -> Outcome:
     collection = store.setting.collection
-    target = load_ref(objects, record.object, collection.collision)
-    primitive = PRIMITIVES.get(row.primitive)
-    scene = Scene(target, record.dynamics, collection.fidelity, primitive, collection.gripper)
-    if record.dynamics.direction is not Direction.AS_BUILT:
-        scene.restrict(first_positions(row.joint_limits, record.dynamics.direction))
-    scene.put(row.joint_positions)
-    return Trial(scene, row.action, row.target_part, primitive, collection.fidelity).run()
-
-
-def first_positions(limits: Float, direction: Direction) -> Float:
-    """Where the joints stood when their limits were set, from the limits [parts, 2] that came of it."""
-    match direction:
-        case Direction.CLOCKWISE:
-            positions = limits[:, 0]
-        case Direction.COUNTER_CLOCKWISE:
-            positions = limits[:, 1]
-        case _:
-            positions = limits.mean(axis=1)
-    return np.asarray(positions, np.float64)
+    scene = restored(load_ref(objects, record.object, collection.collision), collection, record, row)
+    return Trial(scene, row.action, row.target_part, PRIMITIVES.get(row.primitive), collection.fidelity).run()

@@ -72,12 +72,14 @@ class EmbreeCamera:
 
     def capture(self, joint_positions: Float) -> DepthImage:
         """The image with the parts at `joint_positions`, [parts]."""
+        return self.capture_bodies(self._object.body_poses(joint_positions))
+
+    def capture_bodies(self, world_from_bodies: Float) -> DepthImage:
+        """The image with the bodies, whatever joins them, at these poses, [bodies, 4, 4]."""
         depths = np.full(self._size**2, FAR)
         normals = np.zeros((self._size**2, 3))
         bodies = np.zeros(self._size**2, dtype=np.uint8)
-        for number, (body, world_from_body) in enumerate(
-            zip(self._bodies, self._object.body_poses(joint_positions), strict=True)
-        ):
+        for number, (body, world_from_body) in enumerate(zip(self._bodies, world_from_bodies, strict=True)):
             body_from_camera = np.linalg.inv(world_from_body) @ self.world_from_camera
             pixels = self._pixels_around(body.vertices, body_from_camera)
             if len(pixels) == 0:

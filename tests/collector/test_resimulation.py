@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 
 from cluster.cli.main import run
-from cluster.evaluation.resimulation import first_positions, resimulate
-from collector.objects.catalogue import scan
+from cluster.evaluation.resimulation import resimulate
+from collector.objects.catalogue import load_ref, scan
 from collector.objects.procedural import generate
+from collector.sim.restoration import first_positions
 from collector.sim.scene import restricted_limits
+from collector.viz.playback import record
 from collector.worker import Worker
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
+from shared.errors import UsageError
 from shared.plan import Job, Plan, Setting
 from shared.store import Store
 from shared.types import Direction
@@ -49,6 +52,20 @@ def test_rows_come_out_as_they_were_stored(collected: Store, objects: Path) -> N
     chosen = [(row.shard, row.rollout, row.step) for row in found.rows]
     assert len(set(chosen)) == 8
     assert chosen != [(row.shard, row.rollout, row.step) for row in resimulate(collected, objects, 8, seed=2).rows]
+
+
+def test_a_playback_of_a_row_has_the_stored_outcome(collected: Store, objects: Path) -> None:
+    collection = collected.setting.collection
+    for rollout in collected.read_rollouts(collected.committed()[0].shard_id):
+        target = load_ref(objects, rollout.object, collection.collision)
+        row = rollout.interactions[0]
+        again = record(target, collection, rollout, row)
+        assert (again.outcome.kind, again.outcome.success) == (row.outcome.kind, row.outcome.success)
+        assert again.outcome.motion == pytest.approx(row.outcome.motion, abs=5e-3)
+        assert again.joint_positions[0] == pytest.approx(row.joint_positions, abs=1e-6)
+    other = collection.model_copy(update={"simulator": "other"})
+    with pytest.raises(UsageError, match="made with the simulator 'other'; only SAPIEN executes rows again"):
+        record(target, other, rollout, row)
 
 
 def test_a_label_that_lies_is_found(
