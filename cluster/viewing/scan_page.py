@@ -7,13 +7,13 @@ import numpy as np
 import viser
 
 from adaafford.scans import Scan, ScanFrame, observation_of
-from cluster.viewing.beliefs import BODY, Beliefs, Quantity, value_colours
+from cluster.viewing.beliefs import Beliefs, Quantity, value_colours
 from cluster.viewing.marking import Marking
 from cluster.viewing.server import Page, small
 from shared.policies.policy import Policy
 
-MOVABLE, NORMAL = (235, 90, 20), (70, 110, 200)
-NORMALS = 1500
+MOVABLE, PLAIN, NORMAL = (255, 110, 20), (200, 204, 210), (40, 90, 220)
+NORMALS = 800
 """Drawn at the most."""
 SURFACE, BALL = "smooth surface", "ball"
 
@@ -104,7 +104,10 @@ class ScanPage(Page):
     def _draw(self) -> None:
         marking, scene = self.marking, self.server.scene
         points = np.asarray(marking.points, np.float32)
-        colours = np.where(marking.movable[:, None], MOVABLE, BODY).astype(np.uint8)
+        # Lit from the direction of the camera, since a cloud of one colour has no shape.
+        towards = np.array(self.frame.camera) - points.mean(axis=0)
+        light = 0.4 + 0.6 * np.abs(marking.normals @ (towards / max(float(np.linalg.norm(towards)), 1e-9)))
+        colours = (np.where(marking.movable[:, None], MOVABLE, PLAIN) * light[:, None]).astype(np.uint8)
         self.scale.content = ""
         with self.server.atomic():
             scene.remove_by_name("/normals")
@@ -117,7 +120,7 @@ class ScanPage(Page):
                 some = np.linspace(0, len(marking.points) - 1, min(NORMALS, len(marking.points))).astype(int)
                 ends = np.stack([marking.points[some], marking.points[some]], axis=1)
                 ends[:, 1] += 0.04 * self._size * marking.normals[some]
-                scene.add_line_segments("/normals", ends.astype(np.float32), NORMAL)
+                scene.add_line_segments("/normals", ends.astype(np.float32), NORMAL, thickness=0.003 * self._size)
         marked = int(marking.movable.sum())
         self.facts.content = small(
             f"{marked} of {len(marking.points)} points are marked\nSave writes {self.out}, for `adaafford adapt`"

@@ -1,6 +1,7 @@
 """A server of viser for this machine's own browsers, and text that is safe in its page."""
 
 import html
+import io
 import os
 import re
 import socket
@@ -46,7 +47,7 @@ def serving(port: int) -> Iterator[viser.ViserServer]:
     module: Any = websockets.asyncio.server
     module.serve = partial(serve, origins=[_OWN_PAGES, None])
     try:
-        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):  # noqa: PTH123
+        with redirect_stdout(io.StringIO()):
             server = viser.ViserServer(host=HOST, port=port, label="AdaAfford", verbose=False)
     finally:
         module.serve = serve
@@ -56,9 +57,11 @@ def serving(port: int) -> Iterator[viser.ViserServer]:
         if port and server.get_port() != port:
             raise _in_use(port)
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        server.gui.main_panel.dock_right()
         yield server
     finally:
-        server.stop()
+        with redirect_stdout(io.StringIO()):
+            server.stop()
 
 
 def _check_free(port: int) -> None:

@@ -318,13 +318,12 @@ class StorePage(Page):
         playback = record(target, collection, self._rollout, row, FRAMES_A_SECOND)
         self._forget_playback()
         self._playback = playback
-        bodies = [body.visuals or body.collisions for body in target.bodies]
-        colours = [BODY_COLOUR, *(PART_COLOURS[k % len(PART_COLOURS)] for k in range(len(bodies) - 1))]
+        fingers = len(playback.hand) - 1
+        parts = [PART_COLOURS[k % len(PART_COLOURS)] for k in range(len(target.parts))]
+        colours = [BODY_COLOUR, *parts, PALM_COLOUR, *[FINGER_COLOUR] * fingers]
         with self.silently(), self.server.atomic():
-            for number, (meshes, colour) in enumerate(zip(bodies, colours, strict=True)):
-                self._add_mesh(f"/simulation/body{number}", meshes, colour)
-            for number, meshes in enumerate(playback.hand):
-                self._add_mesh(f"/simulation/hand{number}", meshes, FINGER_COLOUR if number else PALM_COLOUR)
+            for number, (body, colour) in enumerate(zip(playback.scenery().bodies, colours, strict=True)):
+                self._add_mesh(f"/simulation/{number}", body.visuals or body.collisions, colour)
             self.span(self.frame, 0, len(playback.times) - 1, 0)
             self.play.disabled = False
             self.put(self.cloud, False)
@@ -350,8 +349,7 @@ class StorePage(Page):
         playback = self._playback
         if playback is None:
             return
-        frame = int(self.frame.value)
-        poses = [*playback.target.body_poses(playback.joint_positions[frame]), *playback.hand_poses[frame]]
+        poses = playback.poses(int(self.frame.value))
         with self.server.atomic():
             for handle, pose in zip(self._moving, poses, strict=True):
                 handle.position, handle.wxyz = pose[:3, 3], quaternion_from_rotation(pose[:3, :3])
