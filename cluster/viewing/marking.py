@@ -4,6 +4,7 @@ Shapes: M points of the scan, W working points: all of them, or an even sample o
 """
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,23 @@ _TOLERANCE_RAD = 0.01
 """How far a click may miss a point."""
 
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Eye:
+    """From where a browser looks at a scan.
+
+    Attributes:
+        place: [3], in the scan's frame.
+        rotation: [3, 3], columns right, down, forward.
+        field_of_view_rad: vertical.
+        aspect: width of the screen over its height.
+    """
+
+    place: Float
+    rotation: Float
+    field_of_view_rad: float
+    aspect: float
 
 
 class Marking:
@@ -91,6 +109,14 @@ class Marking:
         edges = (np.ones(smooth.sum(), bool), (begin[smooth], end[smooth]))
         _, labels = connected_components(coo_array(edges, shape=(len(inside), len(inside))), directed=False)
         return np.asarray(labels == labels[point])
+
+    def box(self, eye: Eye, low: tuple[float, float], high: tuple[float, float]) -> Mask:
+        """The working points in a box of the screen, [W]; low and high from 0, 0 (upper left) to 1, 1."""
+        seen = (self.points - eye.place) @ eye.rotation
+        reach = np.tan(eye.field_of_view_rad / 2) * np.maximum(seen[:, 2:], 1e-9) * np.array([eye.aspect, 1.0])
+        places = (seen[:, :2] / reach + 1) / 2
+        inside: Mask = (seen[:, 2] > 0) & (places >= low).all(axis=1) & (places <= high).all(axis=1)
+        return inside
 
     def mark(self, region: Mask, *, movable: bool) -> None:
         """Mark working points, [W], as movable or not."""

@@ -8,7 +8,7 @@ import viser
 
 from adaafford.scans import Scan, ScanFrame, observation_of
 from cluster.viewing.beliefs import Beliefs, Quantity, value_colours
-from cluster.viewing.marking import Marking
+from cluster.viewing.marking import Eye, Marking
 from cluster.viewing.server import Page, small
 from shared.policies.policy import Policy
 
@@ -47,6 +47,7 @@ class ScanPage(Page):
         self._add_controls()
         server.scene.set_up_direction(frame.up)
         server.scene.on_click()(lambda event: self.click(event.ray_origin, event.ray_direction))
+        server.scene.on_rect_select(modifier="shift")(self._select)
         middle = self.marking.points.mean(axis=0)
         self.look_at(middle, np.array(frame.camera) - middle, self._size)
         self._draw()
@@ -54,7 +55,7 @@ class ScanPage(Page):
     def _add_controls(self) -> None:
         gui, size = self.server.gui, self._size
         with gui.add_folder("Mark what is movable"):
-            gui.add_html(small("Click on a part. A drag turns the view."))
+            gui.add_html(small("Click on a part, or drag a box with Shift. A drag without Shift turns the view."))
             self.movable = gui.add_checkbox("Movable", True, hint="Off: clicks take marks away.")
             self.tool = gui.add_dropdown("Click marks", (SURFACE, BALL))
             step = size / 200
@@ -85,6 +86,15 @@ class ScanPage(Page):
             angle = float(self.angle.value) if self.tool.value == SURFACE else None
             self.say("")
             self._mark(self.marking.region(point, float(self.radius.value), angle), movable=self.movable.value)
+
+    def _select(self, event: viser.SceneRectSelectEvent) -> None:
+        """Mark what is in a box of the screen."""
+        camera = event.client.camera
+        rotation = viser.transforms.SO3(camera.wxyz).as_matrix().astype(np.float64)
+        eye = Eye(camera.position, rotation, camera.fov, camera.aspect)
+        with self.lock:
+            self.say("")
+            self._mark(self.marking.box(eye, event.screen_min, event.screen_max), movable=self.movable.value)
 
     def _mark(self, region: Any, *, movable: bool) -> None:
         self.marking.mark(region, movable=movable)

@@ -263,22 +263,33 @@ def test_a_browser_draws_the_store_and_asks_nobody_else(collected: Path, server:
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_a_click_in_the_browser_marks_points(server: Any, tmp_path: Path) -> None:
-    points = np.random.default_rng(0).uniform([2.0, -0.7, -0.7], [2.001, 0.7, 0.7], (4000, 3))
+    points = np.random.default_rng(0).uniform([2.0, -0.7, -0.7], [2.0, 0.7, 0.7], (4000, 3))
     scan = checked_scan(points)
     page = ScanPage(server, scan, ScanFrame.around(scan), tmp_path / "out.npz", overwrite=False, policy=None)
     with browsing(tmp_path / "profile") as tab:
         tab.open(f"http://127.0.0.1:{server.get_port()}")
         tab.wait_for("document.querySelector('canvas') !== null")
         drawn(tab)
-        box = tab.run(
+        x, y = tab.run(
             "(() => { const r = document.querySelector('canvas').getBoundingClientRect();"
             " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
         )
-        until = time.monotonic() + 60
-        while not page.marking.movable.any():
-            assert time.monotonic() < until
-            tab.click(*box)
-            time.sleep(1)
+        until_marked(page, lambda: tab.click(x, y))
+        front = page.marking.movable
+        page._undo()
+        until_marked(page, lambda: tab.drag((x - 200, y - 200), (x, y), shift=True))
+        # The upper left quarter of what is seen, from the origin along +x, so of larger y and z.
+        some = points[page.marking.movable]
+        assert front.mean() > 0.9 and 100 < len(some) < 2000 and some[:, 1:].min() > -0.05
+
+
+def until_marked(page: ScanPage, act: Any) -> None:
+    """Repeat what should mark points until it does: a page that has just been drawn may not listen yet."""
+    until = time.monotonic() + 60
+    while not page.marking.movable.any():
+        assert time.monotonic() < until, "nothing is marked"
+        act()
+        time.sleep(1)
 
 
 def drawn(tab: Any, other_than: Any = None) -> Any:

@@ -10,7 +10,7 @@ from adaafford import Store, read_scan
 from adaafford.scans import checked_scan
 from cluster.viewing.beliefs import Beliefs, Quantity, part_colours, told_before, value_colours
 from cluster.viewing.browsing import Browser, Filters, choices
-from cluster.viewing.marking import Marking
+from cluster.viewing.marking import Eye, Marking
 from shared.errors import UsageError
 from shared.io import files
 from shared.plan import Job, Plan
@@ -181,6 +181,25 @@ def test_a_click_marks_the_smooth_surface_that_the_eye_sees() -> None:
     assert (ball == (np.linalg.norm(marking.points - marking.points[point], axis=1) <= 0.2)).all()
     assert marking.pick(np.array([-3.0, 0.5, 5.0]), np.array([1.0, 0.0, 0.0])) is None
     assert marking.pick(np.array([-3.0, 0.5, 0.5]), np.array([-1.0, 0.0, 0.0])) is None, "behind the eye"
+
+
+def test_a_box_of_the_screen_marks_what_is_seen_in_it() -> None:
+    marking = box_scan()
+    # From 1 m before the middle of the front, along +x; the right of the screen is towards -y.
+    rotation = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    eye = Eye(np.array([-1.0, 0.5, 0.51]), rotation, np.pi / 2, 1.0)
+    front = marking.points[:, 0] == 0
+    assert marking.box(eye, (0.0, 0.0), (1.0, 1.0))[front].all()
+    right, upper = marking.box(eye, (0.5, 0.0), (1.0, 1.0)), marking.box(eye, (0.0, 0.0), (1.0, 0.5))
+    assert (right[front] == (marking.points[front, 1] <= 0.5)).all()
+    assert (upper[front] == (marking.points[front, 2] >= 0.51)).all()
+    wide = replace(eye, aspect=2.0)
+    assert not marking.box(wide, (0.0, 0.0), (0.37, 1.0))[front].any(), (
+        "0.5 of 2 from the middle is 0.375 from the edge"
+    )
+    assert not marking.box(replace(eye, place=np.array([2.0, 0.5, 0.5])), (0.0, 0.0), (1.0, 1.0)).any(), (
+        "behind the eye"
+    )
 
 
 def test_marks_add_up_are_taken_away_and_undone() -> None:

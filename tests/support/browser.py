@@ -71,9 +71,20 @@ class Tab:
 
     def click(self, x: float, y: float) -> None:
         """Press and release the mouse."""
-        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-            pressed = {} if kind == "mouseMoved" else {"button": "left", "clickCount": 1}
-            self.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **pressed)
+        self.drag((x, y), (x, y))
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], *, shift: bool = False) -> None:
+        """Move the mouse from one place to another with its button pressed."""
+        keys = {"modifiers": 8 if shift else 0}
+        steps = [
+            ("mouseMoved", start, 0),
+            ("mousePressed", start, 1),
+            ("mouseMoved", end, 1),
+            ("mouseReleased", end, 0),
+        ]
+        for kind, (x, y), held in steps:
+            button = {"button": "none"} if kind == "mouseMoved" and not held else {"button": "left", "clickCount": 1}
+            self.ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, buttons=held, **button, **keys)
 
     def picture(self) -> bytes:
         """The page as PNG."""

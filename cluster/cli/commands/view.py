@@ -34,8 +34,8 @@ class ViewCommand:
     target: Annotated[str, tyro.conf.Positional]
     """A store (folder or s3:// URL), a run, or a scan (.ply, .npz or .pcd)."""
     policy: tuple[str, ...] = ()
-    """One or two policies to be shown first, side by side: names of bundled policies, folders, or finished runs. A
-    store's published policies can be chosen in the browser."""
+    """One or two policies to be shown first, side by side: names of bundled policies, folders, or finished runs.
+    Default: the newest policy of the store, if it has one; all of its policies can be chosen in the browser."""
     objects: Path | None = None
     """Folder of the store's objects, for the simulation. Default: the run's, or the procedural ones of the store."""
     port: int = 8080
@@ -136,10 +136,10 @@ def _store_page(command: ViewCommand) -> "Callable[[viser.ViserServer], object]"
     published = known.policy_versions()
     given = {plain(name): partial(lambda policy: policy, load_policy(name)) for name in dict.fromkeys(command.policy)}
     policies = given | {f"version {each}": partial(_published, known, each) for each in published}
-    newest = [f"version {each}" for each in published[-1:]] if run is not None else []
+    newest = [f"version {each}" for each in published[-1:]]
     from cluster.viewing.store_page import StorePage
 
-    return partial(StorePage, stores=stores, policies=policies, compared=tuple(given) or tuple(newest), objects=objects)
+    return partial(StorePage, stores=stores, policies=policies, compared=[*given] or newest, objects=objects)
 
 
 def _published(store: "Store", version: int) -> "Policy":
