@@ -59,9 +59,7 @@ class ScanPage(Page):
             self.movable = gui.add_checkbox("Movable", True, hint="Off: clicks take marks away.")
             self.tool = gui.add_dropdown("Click marks", (SURFACE, BALL))
             step = size / 200
-            self.radius = gui.add_slider(
-                "Radius, m", step, size, step, size if self.marking.movable.any() else size / 2
-            )
+            self.radius = gui.add_slider("Radius, m", step, 2 * size, step, 2 * size)
             self.angle = gui.add_slider("Bend, deg", 1.0, 60.0, 1.0, 15.0, hint="Between neighbouring points.")
             undo = gui.add_button("Undo")
             clear = gui.add_button("Clear")
@@ -71,6 +69,7 @@ class ScanPage(Page):
             self.normals = gui.add_checkbox("Normals", False)
             self.affordance = gui.add_checkbox("Affordance", False, visible=self.beliefs is not None)
             self.scale = gui.add_html("")
+        self.on(self.tool, call=lambda: self.put(self.radius, 2 * size if self.tool.value == SURFACE else 10 * step))
         self.on(undo, call=self._undo)
         self.on(clear, call=lambda: self._mark(np.ones(len(self.marking.points), bool), movable=False))
         self.on(save, call=self._save)
