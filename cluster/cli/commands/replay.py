@@ -53,7 +53,7 @@ def replay(command: ReplayCommand) -> int:
         raise UsageError("--step, --success and --failure choose what is shown; give --video FILE, too")
     if not command.shard:
         raise UsageError("name the shard whose job is executed again, or a file with --video")
-    return _execute(command)
+    return _replay_job(command)
 
 
 def _show(command: ReplayCommand, out: Path) -> int:
@@ -85,7 +85,7 @@ def _show(command: ReplayCommand, out: Path) -> int:
     return 0
 
 
-def _execute(command: ReplayCommand) -> int:
+def _replay_job(command: ReplayCommand) -> int:
     from collector.stopwatch import StageClock
     from collector.worker import Worker
     from shared.store import Store
