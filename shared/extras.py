@@ -8,6 +8,7 @@ from shared.errors import UsageError
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
     "report": ("matplotlib", "plotly", "jinja2"),
+    "video": ("av",),
     "view": ("viser",),
     "import": ("trimesh", "pycollada", "mujoco"),
     "ray-data": ("ray", "pandas"),

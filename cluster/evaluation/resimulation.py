@@ -10,7 +10,7 @@ import numpy as np
 from collector.objects.catalogue import load_ref
 from collector.sim.restoration import refuse_other_simulators, restored
 from collector.sim.trial import Trial
-from shared.errors import StoreError
+from shared.errors import StoreError, UsageError
 from shared.primitives import PRIMITIVES
 from shared.records import InteractionRecord, RolloutRecord
 from shared.seeds import generator
@@ -101,6 +101,43 @@ def _chosen(store: Store, rows: int, seed: int) -> dict[str, list[tuple[int, int
     for row in (labels[k] for k in sorted(picked.tolist())):
         by_shard.setdefault(row["shard"], []).append((row["rollout"], row["step"]))
     return by_shard
+
+
+def chosen_interactions(
+    store: Store, shard: str = "", rollout: int | None = None, step: int | None = None, success: bool | None = None
+) -> tuple[RolloutRecord, tuple[InteractionRecord, ...]]:
+    """A whole rollout of a store, if only that is chosen, or else the first interaction that fits.
+
+    Args:
+        store: which one.
+        shard: name of the only shard that counts; "": all count.
+        rollout: number of the rollout; None: any.
+        step: number of the interaction within the rollout; None: any.
+        success: label of the interaction; None: any.
+
+    Raises:
+        UsageError: there is none, or several plans have a rollout of this number.
+        StoreError: the store is damaged.
+    """
+    wanted = {"rollout": rollout, "step": step, "success": success}
+    where = [(name, "=", value) for name, value in wanted.items() if value is not None]
+    table = store.interactions(["rollout", "step", "success", "outcome"], where=where).to_pylist()
+    found = [row for row in table if OutcomeKind(row["outcome"]).is_label and shard in ("", row["shard"])]
+    if not found:
+        chosen = [f"{name} {value}" for name, value in wanted.items() if value is not None]
+        chosen += [f"shard {shard}"] if shard else []
+        raise UsageError(
+            f"{store.where}: has no interaction" + (f" of {', '.join(chosen)}" if chosen else "") + "; choose another "
+            "(rollouts and steps are columns of interactions.parquet)"
+        )
+    shards = list(dict.fromkeys(row["shard"] for row in found))
+    if rollout is not None and len(shards) > 1:
+        raise UsageError(f"{store.where}: several plans have a rollout {rollout}; name one of: {', '.join(shards)}")
+    first = found[0]
+    record = next(each for each in store.read_rollouts(first["shard"]) if each.index == first["rollout"])
+    if rollout is not None and step is None and success is None:
+        return record, tuple(row for row in record.interactions if row.outcome.kind.is_label)
+    return record, tuple(row for row in record.interactions if row.step == first["step"])
 
 
 def _again(store: Store, objects: Path, record: RolloutRecord, row: InteractionRecord) -> Outcome:

@@ -10,19 +10,19 @@ from matplotlib.figure import Figure
 from collector.objects.articulation import ArticulatedObject
 from collector.random_proposer import RandomProposer
 from collector.recorder import interact
-from collector.sim.camera import DepthImage, EmbreeCamera
 from collector.sim.environment import SapienEnvironment
 from collector.sim.grippers import GRIPPERS
 from collector.stopwatch import StageClock
 from collector.viz.playback import Playback, RecordedTrial, caption
-from collector.viz.preview import body_colours, save, shaded
+from collector.viz.preview import save
+from collector.viz.rendering import Picture, Renderer, with_most_of_the_hand
 from shared import seeds
-from shared.config import PANDA, CameraConfig, CollectionConfig
+from shared.config import PANDA, CollectionConfig
 from shared.errors import UsageError
 from shared.geometry import camera_pose
 from shared.primitives import PRIMITIVES
 from shared.tasks import task_named
-from shared.types import Action, Float, HiddenDynamics, Observation, Outcome
+from shared.types import Action, HiddenDynamics, Observation, Outcome
 
 DYNAMICS = HiddenDynamics(part_mass=0.2, joint_friction=0.3, surface_friction=2.0)
 SEEN_FROM = (190.0, 40.0)
@@ -33,9 +33,9 @@ ENOUGH = 4
 """Successes, of which the one that takes the touched point the farthest is shown."""
 EDGE_SHARE = 0.5
 """As in pull tasks; pushes there move their part as well."""
-SIDES_DEG = (-50.0, 50.0)
-"""Azimuths of the film's camera, from straight behind the hand; the one from which more of the hand is seen is used."""
-CLOSE_UP = CameraConfig(image_size=260, field_of_view_deg=14.0)
+SIDES_DEG, ELEVATION_DEG, DISTANCE = (-50.0, 50.0), 25.0, 5.0
+"""Of the film's camera; of the two sides, the one from which more of the hand is seen is used."""
+IMAGE_SIZE, FIELD_OF_VIEW_DEG = 260, 14.0
 
 
 def film(
@@ -63,14 +63,14 @@ def film(
     takes = [_best_take(target, primitive, gripper, seed) for primitive in primitives]
     across = 1 if len(takes) < 4 else 2
     rows = int(np.ceil(len(takes) / across))
-    figure = Figure(figsize=(across * 3 * 2.2, rows * 2.5), dpi=CLOSE_UP.image_size / 2.2)
+    figure = Figure(figsize=(across * 3 * 2.2, rows * 2.5), dpi=IMAGE_SIZE / 2.2)
     FigureCanvasAgg(figure)
     grid = figure.subplots(rows, across * 3, squeeze=False)
     for axes in grid.ravel():
         axes.set_axis_off()
     for number, take in enumerate(takes):
         row, column = divmod(number, across)
-        for place, (moment, image) in enumerate(zip(_moments(take), _pictures(take), strict=True)):
+        for place, (moment, image) in enumerate(zip(take.moments, _pictures(take), strict=True)):
             axes = grid[row, 3 * column + place]
             axes.imshow(image)
             axes.text(0.5, -0.05, moment, fontsize=7, ha="center", transform=axes.transAxes)
@@ -121,27 +121,9 @@ def _takes(target: ArticulatedObject, primitive: str, gripper: str, seed: int) -
                 yield take
 
 
-def _moments(take: Playback) -> dict[str, int]:
-    """What there is to be seen, in order: frames."""
-    last = len(take.times) - 1
-    if take.contact is None:
-        return {"start": 0, "end, no contact": last}
-    return {"start": 0, "first contact": take.contact, "end": last}
-
-
-def _pictures(take: Playback) -> list[Float]:
+def _pictures(take: Playback) -> list[Picture]:
     """The moments from the side that shows more of the hand, the camera on the touched point."""
-    parts, scenery = len(take.target.parts), take.scenery()
-    shots = [[_capture(take, scenery, frame, side) for frame in _moments(take).values()] for side in SIDES_DEG]
-    best = max(shots, key=lambda images: sum(int((i.bodies > parts).sum()) for i in images))
-    colours = body_colours(parts, len(take.hand))
-    return [shaded(image, colours, CLOSE_UP.image_size) for image in best]
-
-
-def _capture(take: Playback, scenery: ArticulatedObject, frame: int, side_deg: float) -> DepthImage:
-    behind = -take.action.approach
-    level = float(np.hypot(behind[0], behind[1]))
-    azimuth = np.rad2deg(np.arctan2(behind[1], behind[0])) if level > 0.3 else 180.0
-    camera = camera_pose(float(azimuth) + side_deg, 25.0, CLOSE_UP.distance)
-    camera[:3, 3] += take.action.point
-    return EmbreeCamera(scenery, camera, CLOSE_UP).capture_bodies(take.poses(frame))
+    places = [take.seen_from(side, ELEVATION_DEG, DISTANCE) for side in SIDES_DEG]
+    place = with_most_of_the_hand(take, places, FIELD_OF_VIEW_DEG)
+    renderer = Renderer(take, place, IMAGE_SIZE, IMAGE_SIZE, FIELD_OF_VIEW_DEG)
+    return [renderer.picture(frame) for frame in take.moments.values()]

@@ -11,6 +11,7 @@ from collector.sim.restoration import restored
 from collector.sim.scene import Scene
 from collector.sim.trial import Trial
 from shared.config import CollectionConfig, Fidelity
+from shared.geometry import camera_pose
 from shared.primitives import PRIMITIVES
 from shared.records import InteractionRecord, RolloutRecord
 from shared.types import Action, Float, Outcome
@@ -42,6 +43,14 @@ class Playback:
     hand_poses: Float
     contact: int | None
 
+    @property
+    def moments(self) -> dict[str, int]:
+        """What there is to be seen, in order: frames."""
+        last = len(self.times) - 1
+        if self.contact is None:
+            return {"start": 0, "end, no contact": last}
+        return {"start": 0, "first contact": self.contact, "end": last}
+
     def scenery(self) -> ArticulatedObject:
         """The bodies of the object and then the links of the hand, which no joint joins, for a camera."""
         hand = (Body("", "hand", None, shapes, ()) for shapes in self.hand)
@@ -50,6 +59,21 @@ class Playback:
     def poses(self, frame: int) -> Float:
         """Where the bodies of `scenery` are in a frame, [bodies, 4, 4], world_from_body."""
         return np.concatenate([self.target.body_poses(self.joint_positions[frame]), self.hand_poses[frame]])
+
+    def seen_from(self, side_deg: float, elevation_deg: float, distance: float) -> Float:
+        """The pose of a camera that looks at the touched point, [4, 4].
+
+        Args:
+            side_deg: azimuth from straight behind the hand, or from the object's front where the hand comes from above.
+            elevation_deg: above the horizon.
+            distance: from the point.
+        """
+        behind = -self.action.approach
+        level = float(np.hypot(behind[0], behind[1]))
+        azimuth = float(np.rad2deg(np.arctan2(behind[1], behind[0]))) if level > 0.3 else 180.0
+        place = camera_pose(azimuth + side_deg, elevation_deg, distance)
+        place[:3, 3] += self.action.point
+        return place
 
     def at_rate(self, frames_a_second: float) -> "Playback":
         """The same trial with frames at equal intervals of time; the last one shows the end."""
