@@ -159,8 +159,10 @@ class StorePage(Page):
         if not self._browser.has_page(number):
             self.say("this is the first page" if number < 0 else "this is the last page")
             return
-        self._number = number
+        self.say("searching ...")
         self._matches = {_named(match): match for match in self._browser.page(number)}
+        self._number = number
+        self.say("")
         with self.silently():
             self.choose(self.rollout, tuple(self._matches) or (NONE,))
         self._open_rollout()

@@ -24,9 +24,9 @@ PROPOSED = Plan(setting=fabricate_setting(), proposer="aip", policy_version=2)
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(where: str) -> Store:
     """Seven rollouts of two plans in four shards."""
-    store = Store.create(tmp_path / "store", RANDOM.setting)
+    store = Store.create(where, RANDOM.setting)
     for plan, start, stop in ((RANDOM, 0, 2), (RANDOM, 2, 4), (RANDOM, 4, 5), (PROPOSED, 0, 2)):
         job = Job(plan.key, start, stop)
         store.commit(plan, job, fabricate_rollouts(plan, job), {})
