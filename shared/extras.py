@@ -9,7 +9,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
     "report": ("matplotlib", "plotly", "jinja2"),
     "video": ("av",),
-    "view": ("viser",),
+    "view": ("viser", "websockets"),
     "import": ("trimesh", "pycollada", "mujoco"),
     "ray-data": ("ray", "pandas"),
     "wandb": ("wandb",),

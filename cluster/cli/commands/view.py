@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -126,7 +126,10 @@ def _store_page(command: ViewCommand) -> "Callable[[viser.ViserServer], object]"
         stores = {name: Store.open(place) for name, place in places.items() if place.is_dir()}
         if not stores:
             raise UsageError(f"{command.target}: the run has no store yet; wait until it collects")
-        objects, known = command.objects or run.objects_folder(), next(iter(stores.values()))
+        objects, known = command.objects, next(iter(stores.values()))
+        if objects is None:
+            with suppress(UsageError):  # Only the simulation needs them, and says so.
+                objects = run.objects_folder()
     else:
         known = Store.open(command.target)
         stores, beside = {"store": known}, folder_beside(command.target, "objects")
