@@ -55,8 +55,9 @@ class Clip:
         outcome, again = row.outcome, playback.outcome
         part = playback.target.bodies[row.target_part]
         unit = "rad" if part.joint is not None and part.joint.kind == "revolute" else "m"
+        ref = rollout.object
         lines = [
-            f"{rollout.object.category} {rollout.object.id}",
+            ref.id if ref.category.lower() in ref.id.lower() else f"{ref.category} {ref.id}",
             f"{'success' if outcome.success else 'failure'} ({outcome.kind}), moved {outcome.motion:.3f} {unit}",
             f"{row.primitive}, part {row.target_part} {part.part_name}",
             f"proposed by {row.proposer}" + (f", policy {row.policy_version}" if row.policy_version else ""),

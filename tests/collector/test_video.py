@@ -1,5 +1,6 @@
 """Videos of stored interactions: they decode again, show what happened, and bad choices are refused in one line."""
 
+import dataclasses
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -135,6 +136,34 @@ def test_the_first_interaction_with_a_label_is_shown(
     with Image.open(out) as image:
         assert image.width == WIDTH
         assert image.height in (2 * HEIGHT, 3 * HEIGHT)
+
+
+@pytest.mark.usefixtures("short_and_small")
+def test_a_video_that_is_interrupted_leaves_nothing(collected: Store, objects: Path, tmp_path: Path) -> None:
+    collection = collected.setting.collection
+    rollout = collected.read_rollouts(collected.committed()[0].shard_id)[0]
+    target, row = load_ref(objects, rollout.object, collection.collision), rollout.interactions[0]
+    clip = video.Clip.of(record(target, collection, rollout, row, 25), rollout, row)
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        video.write_video([clip], tmp_path / "made/one.gif", interrupt)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_caption_has_the_stored_outcome_and_says_where_it_was_another(collected: Store, objects: Path) -> None:
+    collection = collected.setting.collection
+    rollout = collected.read_rollouts(collected.committed()[0].shard_id)[0]
+    target, row = load_ref(objects, rollout.object, collection.collision), rollout.interactions[0]
+    playback = record(target, collection, rollout, row)
+    other = dataclasses.replace(row, outcome=dataclasses.replace(row.outcome, success=not row.outcome.success))
+    same, differs = (video.Clip.of(playback, rollout, each) for each in (row, other))
+    assert same.lines[1].startswith("success" if row.outcome.success else "failure")
+    assert differs.lines[1].startswith("failure" if row.outcome.success else "success")
+    assert not any("executed again" in line for line in same.lines)
+    assert differs.lines[-1].startswith("executed again: " + ("success" if row.outcome.success else "failure"))
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,8 @@ def test_a_bucket_that_refuses_ends_an_export_in_one_line_and_it_goes_on(
         "gs://bucket/data": "no place for a store; allowed: a folder, or s3://BUCKET/PREFIX",
     }.items():
         assert line in refused([*args, url], capsys)
+    with pytest.raises(UsageError, match="a path cannot hold the two slashes of a URL"):
+        export(store, Path("s3://bucket/data"), SPLITS)
     assert "--push puts the files of a folder on the Hub" in refused([*args, s3_url, "--push", "me/data"], capsys)
 
 

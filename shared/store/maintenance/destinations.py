@@ -25,7 +25,7 @@ from shared.io.files import (
     sync_folder,
     write_atomically,
 )
-from shared.store.backends.base import is_url
+from shared.store.backends.base import backend_of, is_url
 from shared.store.layout import MAX_DOCUMENT_BYTES
 from shared.store.presence import present
 
@@ -89,7 +89,10 @@ def destination(out: str | Path) -> Destination:
     Raises:
         UsageError: it is there already, or its URL is not allowed.
     """
-    return BucketDestination(str(out)) if is_url(out) else DiskDestination(Path(out))
+    if is_url(out):
+        return BucketDestination(str(out))
+    backend_of(out)  # Refuses a path that was meant as a URL.
+    return DiskDestination(Path(out))
 
 
 class DiskDestination:
