@@ -21,6 +21,7 @@ from shared.io.text import plain
 from shared.types import Action, Float
 
 HOST = "127.0.0.1"
+STOP_S = 20.0
 _OWN_PAGES = re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
 """Origins whose scripts may talk to the server: its own page, perhaps through a forwarded port."""
 SUCCESS, FAILURE, FORWARD = (34, 139, 60), (200, 30, 40), (40, 90, 220)
@@ -62,6 +63,9 @@ def serving(port: int) -> Iterator[viser.ViserServer]:
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
+            # It waits for a second, but its thread says something at its very end.
+            if (thread := server._websock_server._server_thread) is not None:
+                thread.join(STOP_S)
 
 
 def _check_free(port: int) -> None:

@@ -272,6 +272,8 @@ def test_a_click_in_the_browser_marks_points(server: Any, tmp_path: Path) -> Non
     with browsing(tmp_path / "profile") as tab:
         tab.open(f"http://127.0.0.1:{server.get_port()}")
         tab.wait_for("document.querySelector('canvas') !== null")
+        # The controls take their place beside the canvas a moment after it is there.
+        tab.wait_for("document.querySelector('canvas').clientWidth < innerWidth - 100")
         drawn(tab)
         x, y = tab.run(
             "(() => { const r = document.querySelector('canvas').getBoundingClientRect();"
@@ -287,12 +289,15 @@ def test_a_click_in_the_browser_marks_points(server: Any, tmp_path: Path) -> Non
 
 
 def until_marked(page: ScanPage, act: Any) -> None:
-    """Repeat what should mark points until it does: a page that has just been drawn may not listen yet."""
-    until = time.monotonic() + 60
-    while not page.marking.movable.any():
-        assert time.monotonic() < until, "nothing is marked"
+    """Do what marks points until some are marked: a page that has just been drawn may not listen yet."""
+    for _ in range(4):
         act()
-        time.sleep(1)
+        until = time.monotonic() + 20
+        while time.monotonic() < until:
+            if page.marking.movable.any():
+                return
+            time.sleep(0.1)
+    raise AssertionError("nothing is marked")
 
 
 def drawn(tab: Any, other_than: Any = None) -> Any:

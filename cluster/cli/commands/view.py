@@ -52,14 +52,15 @@ class ViewCommand:
 
 def main(args: list[str]) -> int:
     """Show something until Ctrl-C."""
-    with viewing(parse_flags(ViewCommand, args, "view")) as server:
-        port = server.get_port()
-        print(f"http://127.0.0.1:{port} shows it, on this machine only; Ctrl-C ends the viewer")
-        print(f"from another machine: ssh -L {port}:127.0.0.1:{port} HOST, then the same address", flush=True)
-        try:
+    command = parse_flags(ViewCommand, args, "view")
+    try:
+        with viewing(command) as server:
+            port = server.get_port()
+            print(f"http://127.0.0.1:{port} shows it, on this machine only; Ctrl-C ends the viewer")
+            print(f"from another machine: ssh -L {port}:127.0.0.1:{port} HOST, then the same address", flush=True)
             threading.Event().wait()
-        except KeyboardInterrupt:
-            print("the viewer has ended")
+    except KeyboardInterrupt:
+        print("the viewer has ended")
     return 0
 
 
