@@ -293,7 +293,7 @@ def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = PO
     normals = np.zeros_like(places) if scan.normals is None else scan.normals[kept] @ frame.world_from_scan.T
     unknown = np.linalg.norm(normals, axis=1) <= _MIN_NORMAL
     if unknown.any():
-        normals[unknown] = _estimated_normals(frame.to_world(scan.points), places[unknown])
+        normals[unknown] = estimated_normals(frame.to_world(scan.points), places[unknown])
     movable = np.ones(len(kept), dtype=bool) if scan.movable is None else scan.movable[kept]
     if not movable.any():
         raise UsageError("the cloud has no movable point; look from another side, or mark the points to act on")
@@ -394,7 +394,7 @@ def _mask(values: NDArray[np.generic], source: str) -> NDArray[np.bool_]:
     return values.astype(bool)
 
 
-def _estimated_normals(cloud: Float, points: Float) -> Float:
+def estimated_normals(cloud: Float, points: Float) -> Float:
     """Normals of local planes, [N, 3], of either sign."""
     _, near = cKDTree(cloud).query(points, k=min(_NORMAL_NEIGHBOURS, len(cloud)))
     local = cloud[near] - cloud[near].mean(axis=1, keepdims=True)

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cluster.collection.status_writer import read_status
@@ -63,15 +63,20 @@ def main() -> None:
         if not store.exists():
             fabricate_store(store, shards)
         for command in arguments.commands:
-            print(f"| {command} | {shards} | {_measure(command, store, out, arguments.limit)} |", flush=True)
+            one = ["benchmarks.many_shards", "--one", command, str(store), str(out)]
+            print(f"| {command} | {shards} | {measured(one, arguments.limit)} |", flush=True)
             shutil.rmtree(out, ignore_errors=True)
 
 
-def _measure(command: str, store: Path, out: Path, limit_s: float) -> str:
-    """The table's cells of one command: peak of memory, processor time, wall time, and how far it came."""
+def measured(arguments: Sequence[str], limit_s: float) -> str:
+    """The table's cells of one command: peak of memory, processor time, wall time, and how far it came.
+
+    Args:
+        arguments: a module and its arguments; it prints how many shards are done, now and then.
+        limit_s: after which it is ended.
+    """
     begun = time.monotonic()
-    arguments = [sys.executable, "-m", "benchmarks.many_shards", "--one", command, str(store), str(out)]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen([sys.executable, "-m", *arguments], stdout=subprocess.PIPE, text=True) as child:
         signal.signal(signal.SIGALRM, lambda *_: child.terminate())
         signal.setitimer(signal.ITIMER_REAL, limit_s)
         _, status, used = os.wait4(child.pid, 0)

@@ -8,6 +8,8 @@ from shared.errors import UsageError
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
     "report": ("matplotlib", "plotly", "jinja2"),
+    "video": ("av",),
+    "view": ("viser", "websockets"),
     "import": ("trimesh", "pycollada", "mujoco"),
     "gym": ("gymnasium",),
     "ray-data": ("ray", "pandas"),

@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from collector.objects.catalogue import load_ref
-from collector.sim.scene import Scene
+from collector.sim.restoration import refuse_other_simulators, restored
 from collector.sim.trial import Trial
-from shared.config import SAPIEN
 from shared.errors import StoreError, UsageError
 from shared.primitives import PRIMITIVES
 from shared.records import InteractionRecord, RolloutRecord
 from shared.seeds import generator
 from shared.store import Store
-from shared.types import Direction, Float, Outcome, OutcomeKind
+from shared.types import Float, Outcome, OutcomeKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +78,7 @@ def resimulate(
         ObjectError: an object is missing, or its files are others.
         UsageError: another simulator made the store.
     """
-    if (simulator := store.setting.collection.simulator) != SAPIEN:
-        raise UsageError(f"{store.where}: made with the simulator '{simulator}'; only SAPIEN executes rows again")
+    refuse_other_simulators(store.setting.collection)
     replayed = []
     for shard, chosen in _chosen(store, rows, seed).items():
         records = {record.index: record for record in store.read_rollouts(shard)}
@@ -105,24 +103,44 @@ def _chosen(store: Store, rows: int, seed: int) -> dict[str, list[tuple[int, int
     return by_shard
 
 
+def chosen_interactions(
+    store: Store, shard: str = "", rollout: int | None = None, step: int | None = None, success: bool | None = None
+) -> tuple[RolloutRecord, tuple[InteractionRecord, ...]]:
+    """A whole rollout of a store, if only that is chosen, or else the first interaction that fits.
+
+    Args:
+        store: which one.
+        shard: name of the only shard that counts; "": all count.
+        rollout: number of the rollout; None: any.
+        step: number of the interaction within the rollout; None: any.
+        success: label of the interaction; None: any.
+
+    Raises:
+        UsageError: there is none, or several plans have a rollout of this number.
+        StoreError: the store is damaged.
+    """
+    wanted = {"rollout": rollout, "step": step, "success": success}
+    where = [(name, "=", value) for name, value in wanted.items() if value is not None]
+    table = store.interactions(["rollout", "step", "success", "outcome"], where=where).to_pylist()
+    found = [row for row in table if OutcomeKind(row["outcome"]).is_label and shard in ("", row["shard"])]
+    if not found:
+        chosen = [f"{name} {value}" for name, value in wanted.items() if value is not None]
+        chosen += [f"shard {shard}"] if shard else []
+        raise UsageError(
+            f"{store.where}: has no interaction" + (f" of {', '.join(chosen)}" if chosen else "") + "; choose another "
+            "(rollouts and steps are columns of interactions.parquet)"
+        )
+    shards = list(dict.fromkeys(row["shard"] for row in found))
+    if rollout is not None and len(shards) > 1:
+        raise UsageError(f"{store.where}: several plans have a rollout {rollout}; name one of: {', '.join(shards)}")
+    first = found[0]
+    record = next(each for each in store.read_rollouts(first["shard"]) if each.index == first["rollout"])
+    if rollout is not None and step is None and success is None:
+        return record, tuple(row for row in record.interactions if row.outcome.kind.is_label)
+    return record, tuple(row for row in record.interactions if row.step == first["step"])
+
+
 def _again(store: Store, objects: Path, record: RolloutRecord, row: InteractionRecord) -> Outcome:
     collection = store.setting.collection
-    target = load_ref(objects, record.object, collection.collision)
-    primitive = PRIMITIVES.get(row.primitive)
-    scene = Scene(target, record.dynamics, collection.fidelity, primitive, collection.gripper)
-    if record.dynamics.direction is not Direction.AS_BUILT:
-        scene.restrict(first_positions(row.joint_limits, record.dynamics.direction))
-    scene.put(row.joint_positions)
-    return Trial(scene, row.action, row.target_part, primitive, collection.fidelity).run()
-
-
-def first_positions(limits: Float, direction: Direction) -> Float:
-    """Where the joints stood when their limits were set, from the limits [parts, 2] that came of it."""
-    match direction:
-        case Direction.CLOCKWISE:
-            positions = limits[:, 0]
-        case Direction.COUNTER_CLOCKWISE:
-            positions = limits[:, 1]
-        case _:
-            positions = limits.mean(axis=1)
-    return np.asarray(positions, np.float64)
+    scene = restored(load_ref(objects, record.object, collection.collision), collection, record, row)
+    return Trial(scene, row.action, row.target_part, PRIMITIVES.get(row.primitive), collection.fidelity).run()

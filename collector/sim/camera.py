@@ -59,12 +59,15 @@ class EmbreeCamera:
         target: the object.
         world_from_camera: [4, 4].
         config: image size and field of view.
+        height: of the image, pixels, if it is not as high as wide; the field of view is then its horizontal one.
     """
 
-    def __init__(self, target: ArticulatedObject, world_from_camera: Float, config: CameraConfig) -> None:
+    def __init__(
+        self, target: ArticulatedObject, world_from_camera: Float, config: CameraConfig, height: int | None = None
+    ) -> None:
         self.world_from_camera = world_from_camera
         self._object = target
-        self._size = config.image_size
+        self._width, self._height = config.image_size, height or config.image_size
         self._focal = focal_length(config)
         if target not in _SCENES:
             _SCENES[target] = tuple(_BodyScene(body) for body in target.bodies)
@@ -72,24 +75,25 @@ class EmbreeCamera:
 
     def capture(self, joint_positions: Float) -> DepthImage:
         """The image with the parts at `joint_positions`, [parts]."""
-        depths = np.full(self._size**2, FAR)
-        normals = np.zeros((self._size**2, 3))
-        bodies = np.zeros(self._size**2, dtype=np.uint8)
-        for number, (body, world_from_body) in enumerate(
-            zip(self._bodies, self._object.body_poses(joint_positions), strict=True)
-        ):
+        return self.capture_bodies(self._object.body_poses(joint_positions))
+
+    def capture_bodies(self, world_from_bodies: Float) -> DepthImage:
+        """The image with the bodies, whatever joins them, at these poses, [bodies, 4, 4]."""
+        count = self._width * self._height
+        depths, normals, bodies = np.full(count, FAR), np.zeros((count, 3)), np.zeros(count, dtype=np.uint8)
+        for number, (body, world_from_body) in enumerate(zip(self._bodies, world_from_bodies, strict=True)):
             body_from_camera = np.linalg.inv(world_from_body) @ self.world_from_camera
             pixels = self._pixels_around(body.vertices, body_from_camera)
             if len(pixels) == 0:
                 continue
-            depth, normal = body.cast(body_from_camera[:3, 3], self._directions(pixels) @ body_from_camera[:3, :3].T)
+            depth, normal = body.cast(body_from_camera[:3, 3], self.directions(pixels) @ body_from_camera[:3, :3].T)
             nearer = (depth > NEAR) & (depth < depths[pixels])
             pixels = pixels[nearer]
             depths[pixels], bodies[pixels] = depth[nearer], number
             normals[pixels] = normal[nearer] @ world_from_body[:3, :3].T
         seen = np.flatnonzero(depths < FAR).astype(np.uint32)
         depths, normals = depths[seen], normals[seen]
-        directions = self._directions(seen) @ self.world_from_camera[:3, :3].T
+        directions = self.directions(seen) @ self.world_from_camera[:3, :3].T
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
         normals *= -np.sign((normals * directions).sum(axis=1, keepdims=True))
         return DepthImage(
@@ -100,23 +104,35 @@ class EmbreeCamera:
             bodies=bodies[seen],
         )
 
+    def in_shadow(self, points: Float, towards: Float, world_from_bodies: Float) -> NDArray[np.bool_]:
+        """Whether the bodies, at these poses, are between points, [P, 3], and a light far away, [3]; world."""
+        shadow = np.zeros(len(points), dtype=np.bool_)
+        for body, world_from_body in zip(self._bodies, world_from_bodies, strict=True):
+            lit = np.flatnonzero(~shadow)
+            rotation, origin = world_from_body[:3, :3], world_from_body[:3, 3]
+            # Not `@`: on a busy machine, the threads of such long products wait for each other.
+            starts = np.einsum("pi,ij->pj", points[lit] - origin, rotation)
+            shadow[lit] = body.blocks(starts, towards @ rotation)
+        return shadow
+
     def _pixels_around(self, vertices: Float, body_from_camera: Float) -> NDArray[np.uint32]:
         """Pixels inside the rectangle that holds the projections of all `vertices`, [V, 3], body frame."""
         if len(vertices) == 0:
             return np.zeros(0, dtype=np.uint32)
         seen = (vertices - body_from_camera[:3, 3]) @ body_from_camera[:3, :3]
         ahead = np.maximum(seen[:, :1], NEAR)
-        places = self._size / 2 - self._focal * seen[:, 1:] / ahead  # Columns grow to the right, rows downwards.
-        low = np.clip(np.floor(places.min(axis=0)), 0, self._size).astype(int)
-        high = np.clip(np.ceil(places.max(axis=0)), 0, self._size).astype(int)
+        size = np.array([self._width, self._height])
+        places = size / 2 - self._focal * seen[:, 1:] / ahead  # Columns grow to the right, rows downwards.
+        low = np.clip(np.floor(places.min(axis=0)), 0, size).astype(int)
+        high = np.clip(np.ceil(places.max(axis=0)), 0, size).astype(int)
         columns, rows = np.arange(low[0], high[0]), np.arange(low[1], high[1])
-        return (rows[:, None] * self._size + columns[None, :]).ravel().astype(np.uint32)
+        return (rows[:, None] * self._width + columns[None, :]).ravel().astype(np.uint32)
 
-    def _directions(self, pixels: NDArray[np.uint32]) -> Float:
+    def directions(self, pixels: NDArray[np.uint32]) -> Float:
         """Ray directions [P, 3], camera frame, through pixel centres, of length 1 along the camera's forward axis."""
-        rows, columns = np.divmod(pixels.astype(np.int64), self._size)
-        left = (self._size / 2 - columns - 0.5) / self._focal
-        up = (self._size / 2 - rows - 0.5) / self._focal
+        rows, columns = np.divmod(pixels.astype(np.int64), self._width)
+        left = (self._width / 2 - columns - 0.5) / self._focal
+        up = (self._height / 2 - rows - 0.5) / self._focal
         return np.stack([np.ones_like(left), left, up], axis=1)
 
 
@@ -159,6 +175,18 @@ class _BodyScene:
         )
         depths = np.where(hits["geomID"] >= 0, hits["tfar"].astype(np.float64), np.inf)
         return depths, hits["Ng"].astype(np.float64)
+
+    def blocks(self, origins: Float, direction: Float) -> NDArray[np.bool_]:
+        """Whether rays from `origins`, [P, 3], in one direction, [3], hit the body; body frame."""
+        if len(self.vertices) == 0 or len(origins) == 0:
+            return np.zeros(len(origins), dtype=np.bool_)
+        directions = np.broadcast_to(direction, origins.shape)
+        hits = self._scene.run(
+            np.ascontiguousarray(origins, dtype=np.float32),
+            np.ascontiguousarray(directions, dtype=np.float32),
+            query="OCCLUDED",
+        )
+        return np.asarray(hits) >= 0
 
 
 _SCENES: WeakKeyDictionary[ArticulatedObject, tuple[_BodyScene, ...]] = WeakKeyDictionary()

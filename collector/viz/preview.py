@@ -19,6 +19,7 @@ from shared.io.files import write_atomically
 from shared.types import Float
 
 BODY_COLOUR = (0.62, 0.62, 0.62)
+PALM_COLOUR, FINGER_COLOUR = (0.2, 0.2, 0.25), (1.0, 0.8, 0.0)
 AMBIENT = 0.5
 """Share of a colour that shows where no light falls."""
 LIGHT_FROM = (-0.6, 0.45, 0.66)
@@ -100,3 +101,8 @@ def part_colours(parts: int) -> Float:
     # The palette's own grey would be taken for the body.
     palette = np.delete(palette, 7, axis=0)
     return np.concatenate([[BODY_COLOUR], palette[np.arange(parts) % len(palette)]])
+
+
+def body_colours(parts: int, links: int) -> Float:
+    """[1 + parts + links, 3]: `part_colours`, then those of the links of a hand, the palm first."""
+    return np.concatenate([part_colours(parts), [PALM_COLOUR, *[FINGER_COLOUR] * (links - 1)]])

@@ -41,6 +41,7 @@ SPEAKING = {
     "store digest": ["store", "digest", "STORE"],
     "objects": ["objects", "check", "OBJECTS"],
     "bench": ["bench", "--help"],
+    "view": ["view", "--help"],
 }
 """Cheap command lines that say something and end with 0."""
 REFUSED = {

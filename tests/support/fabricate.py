@@ -185,11 +185,15 @@ def identical(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-def fabricate_store(path: Path, shards: int, rollouts: int = 2, points: int = 64) -> Store:
-    """A store of many small shards that verifies; they share the files of their clouds, and none is synchronised."""
+def fabricate_store(path: Path, shards: int, rollouts: int = 2, points: int = 64, interactions: int = 1) -> Store:
+    """A store of many shards that verifies; they share the files of their clouds, and none is synchronised.
+
+    Each rollout has one cloud, from which all of its interactions are tried.
+    """
     setting = fabricate_setting(points=points)
     plan, store = Plan(setting=setting), Store.create(path, setting)
-    first = store.commit(plan, Job(plan.key, 0, rollouts), fabricate_rollouts(plan, Job(plan.key, 0, rollouts), 1), {})
+    job = Job(plan.key, 0, rollouts)
+    first = store.commit(plan, job, fabricate_rollouts(plan, job, interactions, interactions), {})
     clouds = {name: (store.shards_folder / first.shard_id / name) for name in first.files if "/" in name}
     made = store.read_rollouts(first.shard_id)
     content = first.model_dump(mode="json")
@@ -198,7 +202,7 @@ def fabricate_store(path: Path, shards: int, rollouts: int = 2, points: int = 64
         folder = store.shards_folder / job.shard_id
         records = [dataclasses.replace(one, index=job.start + k) for k, one in enumerate(made)]
         heads = [RolloutRow(one, k) for k, one in enumerate(records)]
-        rows = [InteractionRow(one, one.interactions[0], k) for k, one in enumerate(records)]
+        rows = [InteractionRow(one, each, k) for k, one in enumerate(records) for each in one.interactions]
         tables = {"rollouts.parquet": table_bytes(ROLLOUT_COLUMNS, heads)}
         tables["interactions.parquet"] = table_bytes(INTERACTION_COLUMNS, rows)
         for parent in sorted({str((folder / name).parent) for name in clouds}):

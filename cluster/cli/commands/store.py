@@ -1,9 +1,6 @@
-"""`adaafford store`: inspect, verify and replay a store, or test a storage backend."""
+"""`adaafford store`: inspect, verify, replay and maintain a store, or test a storage backend."""
 
-import faulthandler
 import json
-import sys
-from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from cluster.cli.commands import upkeep
+from cluster.cli.commands.replay import ReplayCommand, replay
 from cluster.config.flags import Action, dispatch
 from shared.errors import UsageError
 from shared.formatting import finite
@@ -19,7 +17,6 @@ from shared.progress import Progress
 
 if TYPE_CHECKING:
     from cluster.evaluation.resimulation import Divergence
-    from shared.records import RolloutRecord
     from shared.store import Store
 
 MOST_WRITERS, MOST_ROUNDS = 64, 10_000
@@ -61,23 +58,6 @@ class DigestCommand:
 
     store: Annotated[str, tyro.conf.Positional]
     """Folder or s3:// URL of the store."""
-
-
-@dataclass(frozen=True, slots=True)
-class ReplayCommand:
-    """Execute one job in this process, without Ray, to see why it fails; if it succeeds, it is committed.
-
-    With --rollout, that rollout alone is executed, whatever the store says of it, and nothing is committed.
-    """
-
-    store: Annotated[str, tyro.conf.Positional]
-    """Folder or s3:// URL of the store."""
-    shard: Annotated[str, tyro.conf.Positional]
-    """The shard that the job makes, such as random-v0-00000000-00000002."""
-    objects: Path
-    """Folder of the store's objects."""
-    rollout: int | None = None
-    """Number of one rollout of the job."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,45 +182,6 @@ def _digest(command: DigestCommand) -> int:
     return 0
 
 
-def _replay(command: ReplayCommand) -> int:
-    from collector.stopwatch import StageClock
-    from collector.worker import Worker
-    from shared.store import Store
-    from shared.store.layout import parse_shard_id
-
-    store, job = Store.open(command.store), parse_shard_id(command.shard)
-    if job is None:
-        raise UsageError(f"'{command.shard}' names no shard; names look like random-v0-00000000-00000002")
-    plans = {plan.key: plan for plan in store.plans()}
-    if job.plan_key not in plans:
-        raise UsageError(f"{command.store} has no plan '{job.plan_key}'; it has: {', '.join(plans) or 'none'}")
-    if command.rollout is not None and not job.start <= command.rollout < job.stop:
-        raise UsageError(f"rollout {command.rollout} is not of this shard; allowed: {job.start} to {job.stop - 1}")
-    # If the engine crashes, this says where.
-    faulthandler.enable()
-    worker, plan = Worker(command.store, command.objects), plans[job.plan_key]
-    if command.rollout is not None:
-        print(f"executing rollout {command.rollout} alone; nothing is committed", file=sys.stderr)
-        print(_described(worker.execute(plan, command.rollout, StageClock())))
-        return 0
-    print(f"executing {job.shard_id}", file=sys.stderr)
-    print(worker.run(plan, job, under_way=_announce))
-    return 0
-
-
-def _announce(rollout: int | None) -> None:
-    """Print which rollout begins, in case it crashes."""
-    if rollout is not None:
-        print(f"rollout {rollout}", file=sys.stderr, flush=True)
-
-
-def _described(record: "RolloutRecord") -> str:
-    """A rollout in one line."""
-    outcomes = Counter(row.outcome.kind.value for row in record.interactions)
-    counts = ", ".join(f"{name} {count}" for name, count in sorted(outcomes.items())) or "no interactions"
-    return f"rollout {record.index} (object {record.object.id}): {record.status}; {counts}"
-
-
 def _check_place(command: CheckPlaceCommand) -> int:
     from shared.errors import StoreError
     from shared.store import check_place
@@ -265,7 +206,7 @@ ACTIONS: dict[str, Action] = {
     "info": (InfoCommand, _info),
     "verify": (VerifyCommand, _verify),
     "digest": (DigestCommand, _digest),
-    "replay": (ReplayCommand, _replay),
+    "replay": (ReplayCommand, replay),
     **upkeep.ACTIONS,
     "check-place": (CheckPlaceCommand, _check_place),
 }

@@ -58,7 +58,7 @@ class ExportCommand:
     store: Annotated[str, tyro.conf.Positional]
     """Folder or s3:// URL of the store."""
     out: str
-    """A new folder."""
+    """A new folder, or s3:// URL with nothing below it."""
     format: str = "plain"
     """plain (Parquet and Zarr), hf (Parquet with the clouds), lerobot, webdataset, minari, or one of an installed
     package."""
@@ -184,11 +184,8 @@ def _merge(command: MergeCommand) -> int:
 def _export(command: ExportCommand) -> int:
     from learner.data.dataset import read_object_list
     from shared.store import Store, export
-    from shared.store.backends.base import is_url
     from shared.store.maintenance.export import splits_by_share
 
-    if is_url(command.out):
-        raise UsageError(f"{command.out}: an export goes into a folder; name one, and copy it to the bucket afterwards")
     store = Store.open(command.store)
     lists = {"train": read_object_list(command.train_objects), "test": read_object_list(command.test_objects)}
     splits = {name: objects for name, objects in lists.items() if objects is not None}
@@ -197,7 +194,7 @@ def _export(command: ExportCommand) -> int:
     with Progress(f"exporting into {command.out}, shards") as progress:
         done = export(
             store,
-            Path(command.out),
+            command.out,
             splits or splits_by_share(store, command.test_share, command.seed),
             progress.show,
             format=command.format,

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from datetime import timedelta
+from pathlib import Path
 from typing import Any, TypeVar
 
 from obstore.exceptions import AlreadyExistsError, BaseError, GenericError, PreconditionError
@@ -149,6 +150,10 @@ class S3Backend:
     def replace(self, key: str, data: bytes) -> None:
         """See `StorageBackend.replace`."""
         self._ask(lambda: self._client.put(key, data, use_multipart=False), key)
+
+    def upload(self, key: str, path: Path) -> None:
+        """Write a file of this machine, in parts if it is large, so that it is never in memory; also over another."""
+        self._ask(lambda: self._client.put(key, path), key)
 
     def remove(self, key: str) -> None:
         """See `StorageBackend.remove`."""

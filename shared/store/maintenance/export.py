@@ -6,47 +6,32 @@ OUT/
   setting.json     how all of it was collected
   ...              the data, as the format has them (see `shared.store.maintenance.formats`)
 
-While it is written it is called OUT.unfinished. When it is killed, what is finished stays, and the same call goes on:
-
-OUT.unfinished/.export/begun.json      what is exported
-OUT.unfinished/.export/<n>.json        of each finished piece, its files and its summary
+See `shared.store.maintenance.destinations` for how it is called while it is written, and how it goes on.
 """
 
 import hashlib
 import itertools
 import json
-import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shared.errors import StoreError, UsageError
-from shared.io.documents import parse_object
-from shared.io.files import (
-    DRIVER_LOCK,
-    exclusive_lock,
-    read_bounded,
-    remove_tree,
-    sync_file,
-    sync_folder,
-    write_atomically,
-)
+from shared.errors import UsageError
+from shared.io.files import write_atomically
 from shared.io.text import MAX_WORD, plain
 from shared.seeds import generator
-from shared.store.layout import MAX_DOCUMENT_BYTES
+from shared.store.backends.base import is_url
 from shared.store.maintenance.croissant import croissant
 from shared.store.maintenance.datacard import SplitFigures, data_card
-from shared.store.maintenance.formats import EXPORT_FORMATS, PLAIN, ExportFormat, Summary
+from shared.store.maintenance.destinations import NOTES, Destination, destination
+from shared.store.maintenance.formats import EXPORT_FORMATS, PLAIN, ExportFormat
 from shared.store.maintenance.hub import pusher
-from shared.store.maintenance.steps import Content, Piece, Splits, survey
+from shared.store.maintenance.steps import Content, Splits, survey
 from shared.store.store import Store
 
-UNFINISHED = ".unfinished"
 SPLIT_NAME = r"[a-z][a-z0-9_]{0,30}"
-_NOTES, _BEGUN, _PIECE = ".export", "begun.json", "piece"
 Progress = Callable[[int, int], None]
 
 
@@ -78,13 +63,19 @@ def splits_by_share(store: Store, test_share: float, seed: int) -> dict[str, fro
 
 
 def export(
-    store: Store, out: Path, splits: Splits, progress: Progress | None = None, *, format: str = PLAIN, push: str = ""
+    store: Store,
+    out: str | Path,
+    splits: Splits,
+    progress: Progress | None = None,
+    *,
+    format: str = PLAIN,
+    push: str = "",
 ) -> Export:
     """Write a store as plain files; `out` is there when all of it is. After a kill or on a full disk, the same goes on.
 
     Args:
         store: what is written.
-        out: a folder that is not there yet.
+        out: a folder that is not there yet, or s3://BUCKET/PREFIX with nothing below it.
         splits: objects of each split; rows of objects in none are left out.
         progress: called after each shard with how many are done and how many there are; each shard counts when its
             tables are looked through, and again when it is written.
@@ -92,36 +83,31 @@ def export(
         push: "USER/NAME" of a data set on the Hugging Face Hub, where the files are put, too, before `out` is there.
 
     Raises:
-        UsageError: no such format; the folder is there, or cannot be written; or an object is in two splits, or
+        UsageError: no such format; the place is there, or cannot be written; or an object is in two splits, or
             in no store; or the Hub refuses.
         StoreError: the store is damaged, or a split comes out empty.
     """
     chosen = EXPORT_FORMATS.get(format)
     _check_splits(store, splits)
-    if os.path.lexists(out):
-        raise UsageError(f"{out}: is there already; name a new folder")
+    if push and is_url(out):
+        raise UsageError(f"{out}: --push puts the files of a folder on the Hub; name a folder, or leave it out")
+    place = destination(out)
     say = progress or (lambda done, total: None)
-    deliver = pusher(push, _NOTES) if push else None
+    deliver = pusher(push, NOTES) if push else None
     content = survey(store, splits, say)
-    folder = out.with_name(out.name + UNFINISHED)
     try:
-        with _unfinished(folder, _identity(content, chosen)):
-            receipts = list(_pieces(content, chosen, folder, say))
+        with place.begin(_identity(content, chosen)):
+            receipts = list(_pieces(content, chosen, place, say))
+            folder = place.folder
             chosen.finish(content, folder, [receipt["summary"] for receipt in receipts])
             write_atomically(folder / "setting.json", _json(store.setting.as_document()))
             write_atomically(folder / "README.md", data_card(content, chosen).encode())
             write_atomically(folder / "croissant.json", _json(croissant(content, chosen)))
             if deliver is not None:
                 deliver(folder)
-            # It names this machine. The other notes stay until the folder has its name: a kill here loses nothing.
-            (folder / _NOTES / DRIVER_LOCK).unlink()
-            folder.rename(out)
-            remove_tree(out / _NOTES)
-            sync_folder(out.parent)
+            place.complete()
     except OSError as error:
-        why = os.strerror(error.errno) if error.errno else str(error)
-        left = f"; what is finished is in {folder}: repeat the command to go on" if folder.is_dir() else ""
-        raise UsageError(f"{out}: cannot be written ({why}){left}, or name another folder") from None
+        raise place.on_error(error) from None
     return Export(str(out), dict(content.figures))
 
 
@@ -132,78 +118,24 @@ def _identity(content: Content, chosen: ExportFormat) -> dict[str, Any]:
     return {"format": chosen.name, "content": hashlib.sha256(json.dumps(told).encode()).hexdigest()}
 
 
-@contextmanager
-def _unfinished(folder: Path, identity: dict[str, Any]) -> Iterator[None]:
-    """Hold the folder of an export: what the same one left there, or an empty one.
-
-    Raises:
-        UsageError: another process holds it, or it holds something that is no export.
-        OSError: it cannot be made.
-    """
-    notes = folder / _NOTES
-    folder.mkdir(parents=True, exist_ok=True)
-    if not notes.is_dir() and any(folder.iterdir()):
-        raise UsageError(f"{folder}: holds something that is no unfinished export; move it away or name another folder")
-    notes.mkdir(exist_ok=True)
-    with exclusive_lock(notes / DRIVER_LOCK):
-        if _note(notes / _BEGUN) != identity:
-            # Begun by another command, or before the store had grown.
-            for path in [*folder.iterdir(), *notes.iterdir()]:
-                if path not in (notes, notes / DRIVER_LOCK):
-                    remove_tree(path)
-            write_atomically(notes / _BEGUN, json.dumps(identity).encode())
-        yield
-
-
-def _pieces(content: Content, chosen: ExportFormat, folder: Path, progress: Progress) -> Iterator[dict[str, Any]]:
+def _pieces(content: Content, chosen: ExportFormat, place: Destination, progress: Progress) -> Iterator[dict[str, Any]]:
     """Write the pieces that are not there yet; what is known of each, in order."""
     pieces, done = content.pieces(chosen.piece_bytes), content.shards
     total = done + sum(len(piece.parts) for piece in pieces)
     for number, piece in enumerate(pieces):
-        note = folder / _NOTES / f"{number}.json"
-        receipt = _note(note)
-        if receipt is None or any(_size(folder / name) != size for name, size in receipt["files"].items()):
+        receipt = place.note(f"{number}.json")
+        if receipt is None or not place.has(receipt["files"]):
             counted = itertools.count(done + 1)
 
             def shard_done(counted: Iterator[int] = counted) -> None:
                 progress(next(counted), total)
 
-            files, summary = _write_piece(content, chosen, piece, folder, shard_done)
-            receipt = {"files": files, "summary": summary}
-            write_atomically(note, json.dumps(receipt).encode())
+            aside = place.piece()
+            summary = chosen.write(content, piece, aside, shard_done)
+            receipt = {"files": place.take(aside), "summary": summary}
+            place.add_note(f"{number}.json", receipt)
         done += len(piece.parts)
         yield receipt
-
-
-def _write_piece(
-    content: Content, chosen: ExportFormat, piece: Piece, folder: Path, shard_done: Callable[[], None]
-) -> tuple[dict[str, int], Summary]:
-    """Write a piece beside the others, and move it among them once it is there."""
-    aside = folder / _NOTES / _PIECE
-    remove_tree(aside)
-    aside.mkdir()
-    summary = chosen.write(content, piece, aside, shard_done)
-    files = {}
-    for path in sorted(path for path in aside.rglob("*") if path.is_file()):
-        name = path.relative_to(aside)
-        sync_file(path)
-        files[str(name)] = path.stat().st_size
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        path.replace(folder / name)
-    remove_tree(aside)
-    return files, summary
-
-
-def _note(path: Path) -> dict[str, Any] | None:
-    """A note of an export; None where it is missing or was damaged."""
-    try:
-        return parse_object(read_bounded(path, MAX_DOCUMENT_BYTES), str(path))
-    except StoreError:
-        return None
-
-
-def _size(path: Path) -> int | None:
-    return path.stat().st_size if path.is_file() else None
 
 
 def _json(document: dict[str, Any]) -> bytes:
