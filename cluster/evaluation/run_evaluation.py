@@ -134,14 +134,14 @@ def evaluate_without_run(source: str, settings: EvaluateSettings, out: Path | No
     if not (seen := seen_by(source)):
         Console(file=sys.stderr, highlight=False).print(f"policy {unknown(source)}", markup=False, soft_wrap=True)
     refs, folder = _objects(task, settings, settings.objects, lambda ref: ref.content_hash not in seen)
-    files = policy.to_files()
+    needs_depth, files = policy.config.pinch_profile, policy.to_files()
     place = folder_of(source)
     subject = _Subject(
         policy=policy,
         files=lambda version: files,
         version=ONLY_VERSION,
         methods=methods,
-        collection=settings.collection,
+        collection=settings.collection.keeping_depth() if needs_depth else settings.collection,
         oracle=place,
         root=None,
         evaluations=EVALUATIONS,

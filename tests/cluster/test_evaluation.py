@@ -6,6 +6,7 @@ import io
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -265,6 +266,22 @@ def test_evaluate_policy_says_where_its_objects_cannot_be_known(
     for source, said in ((lone, 1), (exported, 0)):
         evaluate_without_run(str(source), FAST.model_copy(update={"objects": finished / "objects"}), None)
         assert capsys.readouterr().err.count("has no record of its training objects") == said
+
+
+def test_evaluate_policy_keeps_depth_images_where_its_networks_need_them(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda subject, *_: told.append(subject))
+    for needed in (False, True):
+        policy = Policy.untrained("push", SMALL_NETWORK.model_copy(update={"pinch_profile": needed}), 0)
+        folder = tmp_path / str(needed)
+        folder.mkdir()
+        for name, data in policy.with_trained("prior").to_files().items():
+            (folder / name).write_bytes(data)
+        evaluate_without_run(str(folder), FAST.model_copy(update={"objects": finished / "objects"}), None)
+    assert [subject.collection.camera.keep_depth for subject in told] == [False, True]
+    assert told[1].collection == told[0].collection.keeping_depth()
 
 
 def test_evaluate_policy_with_a_run_is_the_evaluation_of_the_run(

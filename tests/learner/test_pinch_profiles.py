@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from cluster.config.campaign_config import CampaignConfig
+from cluster.runs.warm_start import with_needed_depth
 from learner.data.augmentation import draw_flips
 from learner.data.dataset import load_dataset
 from learner.data.features import FrozenFeatures, ProposalPool
 from learner.settings import AugmentationConfig, LearnerConfig
 from learner.stages.jobs import StageJob, run_stage
-from shared.config import CameraConfig
+from shared.config import CameraConfig, CollectionConfig
 from shared.errors import UsageError
 from shared.networks.actions import FRAME_WIDTH
 from shared.pinch import BINS, PROFILE_WIDTH
@@ -111,12 +112,27 @@ def test_a_policy_is_not_used_where_no_depth_image_is_kept() -> None:
         policy_of(TOLD).check_camera(CameraConfig())
 
 
-def test_a_campaign_keeps_the_depth_images_that_it_learns_from() -> None:
+def test_a_campaign_keeps_the_depth_images_that_its_networks_need(tmp_path: Path) -> None:
     learner = {"network": {"pinch_profile": True}}
-    with pytest.raises(ValueError, match=r"pinch_profile needs collection\.camera\.keep_depth"):
-        CampaignConfig.model_validate({"learner": learner})
-    kept = {"camera": {"keep_depth": True}}
-    assert CampaignConfig.model_validate({"learner": learner, "collection": kept}).learner.network.pinch_profile
+    config = CampaignConfig.model_validate({"learner": learner})
+    kept = with_needed_depth(config)
+    assert kept == with_needed_depth(kept)
+    assert kept.model_dump() == config.model_dump() | {"collection": kept.collection.model_dump()}
+    assert kept.collection == CollectionConfig(camera=CameraConfig(keep_depth=True))
+    assert with_needed_depth(CampaignConfig()) == CampaignConfig()
+    for networks, name in ((TINY, "plain"), (TOLD, "told")):
+        (tmp_path / name).mkdir()
+        for file, data in policy_of(networks).to_files().items():
+            (tmp_path / name / file).write_bytes(data)
+    for source, needed in (("plain", False), ("told", True)):
+        # The policy decides, and not the networks that would be trained from nothing.
+        started = CampaignConfig.model_validate(
+            {"learner": learner, "start_from": str(tmp_path / source), "task": "push"}
+        )
+        assert with_needed_depth(started).collection.camera.keep_depth == needed
+    large = {"learner": learner, "collection": {"camera": {"image_size": 4096}}}
+    with pytest.raises(UsageError, match=r"collection\.camera.*keep_depth needs an image_size of at most"):
+        with_needed_depth(CampaignConfig.model_validate(large))
 
 
 def test_flips_are_drawn_only_where_they_are_asked_for() -> None:
