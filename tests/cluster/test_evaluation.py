@@ -227,6 +227,20 @@ def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_evaluate_policy_takes_the_folder_of_a_training(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stages = [path.parent for path in sorted((finished / "training").glob("*/policy.json"))]
+    assert any((stage / "config.json").is_file() for stage in stages)
+    told: list[Any] = []
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda subject, *_: told.append(subject))
+    alone = tmp_path / "stage"
+    shutil.copytree(stages[0], alone)  # Out of the run, whose training objects it would leave out.
+    (alone / DONE_FILE).unlink()
+    evaluate_without_run(str(alone), FAST.model_copy(update={"objects": finished / "objects"}), None)
+    assert [subject.label for subject in told] == ["stage"]
+
+
 @pytest.mark.parametrize("named", ["folder", "file"])
 def test_evaluate_policy_without_run_tests_all_objects_but_those_it_has_seen(
     named: str, finished: Path, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -251,9 +265,10 @@ def test_evaluate_policy_without_run_tests_all_objects_but_those_it_has_seen(
     assert one.out.parent == Path("evaluations")
     assert one.out.name.startswith("push-faucet-objects-policy-")
     # The first policy of the run is not known, so the method that uses it is left out.
-    assert set(one.config.methods) == {"where2act", *(name for name in METHODS.names() if name.startswith("ours-"))} - {
-        "ours-no-iteration"
-    }
+    # A reference is compared only where it is named.
+    left_out = {"ours-no-iteration", "ours-value"}
+    ours = {name for name in METHODS.names() if name.startswith("ours-")}
+    assert set(one.config.methods) == ({"where2act"} | ours) - left_out
 
 
 def test_evaluate_policy_says_where_its_objects_cannot_be_known(

@@ -105,6 +105,29 @@ def test_all_stages_learn_with_profiles_and_the_policy_proposes(store: Store, tm
         Adapter(again).frames(dataclasses.replace(seen, dense=None), [record.interactions[0].action])
 
 
+def test_a_policy_gets_pinch_profiles_and_begins_as_the_same_functions(store: Store, tmp_path: Path) -> None:
+    old = policy_of(TINY, seed=3)
+    for name, data in old.to_files().items():
+        (tmp_path / name).write_bytes(data)
+    wider, symmetric = old.with_pinch(True, False, 1), old.with_pinch(True, True, 1)
+    assert wider.config == TOLD
+    assert symmetric.config == TOLD.model_copy(update={"roll_symmetry": True})
+    assert not wider.trained
+    record = store.read_rollouts(store.jobs()[0].shard_id)[0]
+    seen, actions = record.observations[0], [one.action for one in record.interactions]
+    history = [Interaction(seen, one.action, one.outcome) for one in record.interactions[:2]]
+    before, after = Adapter(old), Adapter(wider)
+    np.testing.assert_allclose(after.score(seen, actions, history), before.score(seen, actions, history), rtol=1e-5)
+    np.testing.assert_allclose(after.prior_score(seen, actions), before.prior_score(seen, actions), rtol=1e-5)
+    config = FAST.model_copy(update={"network": TOLD})
+    trained = run_stage(StageJob("prior", store.where, tmp_path / "prior", tmp_path), config)
+    assert trained.config == TOLD
+    assert trained.trained == {"prior"}
+    kept = run_stage(StageJob("prior", store.where, tmp_path / "kept", tmp_path), FAST)
+    assert kept.config == TINY
+    assert kept.trained == old.trained
+
+
 def test_a_policy_is_not_used_where_no_depth_image_is_kept() -> None:
     policy_of(TINY).check_camera(CameraConfig())
     policy_of(TOLD).check_camera(CameraConfig(keep_depth=True))
