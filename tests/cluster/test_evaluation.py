@@ -26,7 +26,8 @@ from collector.worker import Worker
 from learner.evaluation.bootstrap import ratio_interval
 from learner.evaluation.table import EvaluationRow, ObjectCounts
 from learner.metrics import f_score
-from learner.stages.jobs import DONE_FILE
+from learner.settings import LearnerConfig
+from learner.stages.jobs import CONFIG_FILE, DONE_FILE
 from shared.errors import UsageError
 from shared.formatting import csv_table
 from shared.plan import EvaluationConfig, Plan, Setting
@@ -228,16 +229,13 @@ def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_evaluate_policy_takes_the_folder_of_a_training(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    finished: Path, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stages = [path.parent for path in sorted((finished / "training").glob("*/policy.json"))]
-    assert any((stage / "config.json").is_file() for stage in stages)
     told: list[Any] = []
     monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda subject, *_: told.append(subject))
-    alone = tmp_path / "stage"
-    shutil.copytree(stages[0], alone)  # Out of the run, whose training objects it would leave out.
-    (alone / DONE_FILE).unlink()
-    evaluate_without_run(str(alone), FAST.model_copy(update={"objects": finished / "objects"}), None)
+    stage = shutil.copytree(exported, tmp_path / "stage")
+    (stage / CONFIG_FILE).write_text(LearnerConfig().model_dump_json())
+    evaluate_without_run(str(stage), FAST.model_copy(update={"objects": finished / "objects"}), None)
     assert [subject.label for subject in told] == ["stage"]
 
 
