@@ -91,7 +91,8 @@ class CameraConfig(StrictModel):
     renderer: Literal["embree", "sapien"] = "embree"
     """Who renders: Embree on the CPU, or SAPIEN's own renderer, which needs a Vulkan device."""
     keep_depth: bool = Field(False, exclude_if=lambda kept: not kept)
-    """Keep the whole depth image of each observation beside its cloud, some KB, which `network.pinch_profile` needs."""
+    """Keep the whole depth image of each observation beside its cloud, some KB, which `network.pinch_profile` needs:
+    `run` and `evaluate --policy` then switch it on."""
 
     @property
     def depth_size(self) -> int:
@@ -250,6 +251,15 @@ class CollectionConfig(StrictModel):
     """What hidden parameters are drawn from, instead of the ranges of the task. Those of packages are drawn if they
     are named here."""
     rollout: RolloutConfig = RolloutConfig()
+
+    def keeping_depth(self) -> "CollectionConfig":
+        """The same with depth images kept, which networks need that have pinch profiles as input.
+
+        Raises:
+            UsageError: the images are too large for that.
+        """
+        camera = parse(CameraConfig, {**self.camera.model_dump(), "keep_depth": True}, "collection.camera")
+        return self.model_copy(update={"camera": camera})
 
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -59,8 +59,18 @@ class Rates:
     """An action through a critic, forward."""
     trained_row_s: float = 12e-6
     """Forward and backward."""
+    kept_pixel_s: float = 7.3e-9
+    """A pixel of a depth image, packed and compressed."""
+    read_pixel_s: float = 1.6e-8
+    """Unpacked, and turned into a point."""
+    profiled_point_s: float = 1.0e-3
+    """The pinch profiles of actions at a point: what lies around it."""
+    profile_s: float = 1.2e-5
+    """One of these profiles."""
     point_bytes: float = 9.2
     """A point of a stored cloud."""
+    depth_pixel_bytes: float = 0.038
+    """A pixel of a stored depth image, most of which see nothing or a plane."""
     row_bytes: float = 385
     """A stored interaction without its cloud."""
     shard_bytes: float = 8600
@@ -140,7 +150,7 @@ class _Costs:
         with torch.device("meta"):
             weights = Policy(self.task.name, network).modules()
         self.weights_bytes = 4.0 * sum(tensor.numel() for tensor in weights.parameters())
-        self.clouds = 0
+        self.clouds = self.interactions = 0
         self._rows_a_rollout = config.collection.rollout.interactions
 
     def of(self, step: AlternationStep) -> StageCost | None:
@@ -160,6 +170,7 @@ class _Costs:
         interactions = rollouts * self.config.collection.rollout.interactions
         clouds = rollouts * (self._clouds_a_rollout(tries))
         self.clouds += clouds
+        self.interactions += interactions
         return StageCost(
             stage,
             interactions,
@@ -182,7 +193,7 @@ class _Costs:
         by_policy = chosen + sum(n for n, m in zip(tries, trying, strict=True) if m.tries not in (None, RANDOM))
         interactions = rollouts * (told.queries + sum(tries) + chosen)
         clouds = rollouts * (1 + sum(tries))
-        judging_s = clouds * FORWARD_SHARE * self.encode_s * 3
+        judging_s = clouds * FORWARD_SHARE * self.encode_s * 3 + self._profiles_s(clouds, interactions, 1)
         return StageCost(
             "evaluate",
             interactions,
@@ -204,6 +215,9 @@ class _Costs:
             case _:
                 seconds, encoders = self._baseline_s(step.network)
         encoding_s = self.clouds * encoders * FORWARD_SHARE * self.encode_s
+        # The stages between two collections share what the first of them reads.
+        if step.network == "prior" or (step.network == "aap" and step.round > 1):
+            seconds += self._profiles_s(self.clouds, self.interactions, 1)
         return StageCost(step.name, 0, seconds + encoding_s, LEFT_BY_TRAINING * self.weights_bytes)
 
     def _prior_s(self) -> float:
@@ -239,10 +253,19 @@ class _Costs:
 
     def _affordance_s(self, told: AffordanceConfig) -> float:
         answered = told.questions * told.proposals * self.rates.scored_row_s
+        answered += self._profiles_s(0, told.questions, told.proposals)
         return answered + self._steps_s(told.steps, 0, told.points)
 
     def _steps_s(self, steps: int, clouds: int, rows: int) -> float:
         return steps * (clouds * self.encode_s + rows * self.rates.trained_row_s)
+
+    def _profiles_s(self, clouds: int, points: int, actions: int) -> float:
+        """Reading depth images, and the profiles of so many actions at each point; nothing where none are used."""
+        if not self.config.learner.network.pinch_profile:
+            return 0.0
+        rates, camera = self.rates, self.config.collection.camera
+        at_a_point_s = rates.profiled_point_s + actions * rates.profile_s
+        return clouds * camera.depth_size**2 * rates.read_pixel_s + points * at_a_point_s
 
     def _simulation_s(self, rollouts: int, interactions: int, clouds: int) -> float:
         primitive = PRIMITIVES.get(self.task.terms(self.config.collection).primitive)
@@ -251,12 +274,14 @@ class _Costs:
             trial_s = rates.reference_pull_s if pulls else rates.reference_push_s
         else:
             trial_s = rates.pull_s if pulls else rates.push_s
-        return rollouts * (rates.object_s + rates.write_s) + interactions * trial_s + clouds * rates.look_s
+        look_s = rates.look_s + self.config.collection.camera.depth_size**2 * rates.kept_pixel_s
+        return rollouts * (rates.object_s + rates.write_s) + interactions * trial_s + clouds * look_s
 
     def _policy_step_s(self) -> float:
         """One look of the prior, AAP and AIP, and a hundred proposals at every step."""
         points = self.config.collection.camera.points
-        return 3 * FORWARD_SHARE * self.encode_s + 2 * (points + 100) * self.rates.scored_row_s
+        scored_s = 2 * (points + 100) * self.rates.scored_row_s
+        return 3 * FORWARD_SHARE * self.encode_s + scored_s + self._profiles_s(1, 1, 100)
 
     def _clouds_a_rollout(self, tries: int) -> int:
         """How many observations a rollout has: one for each continuing interaction and for each drawn state."""
@@ -268,9 +293,10 @@ class _Costs:
         return continued + (min(left, 1) if self.task.closed else -(-left // told.actions_per_state))
 
     def _stored_bytes(self, rollouts: int, interactions: int, clouds: int) -> float:
-        rates, points = self.rates, self.config.collection.camera.points
+        rates, camera = self.rates, self.config.collection.camera
         shards = -(-rollouts // self.config.rollouts.per_shard)
-        return interactions * rates.row_bytes + clouds * points * rates.point_bytes + shards * rates.shard_bytes
+        cloud_bytes = camera.points * rates.point_bytes + camera.depth_size**2 * rates.depth_pixel_bytes
+        return interactions * rates.row_bytes + clouds * cloud_bytes + shards * rates.shard_bytes
 
 
 def multiply_adds(network: NetworkConfig, points: int) -> float:

@@ -116,12 +116,6 @@ class CampaignConfig(ObjectSelection):
             raise ValueError("start_from fine-tunes in AIP rounds, so alternations must be at least 1; given 0")
         return self
 
-    @model_validator(mode="after")
-    def _keeps_what_is_told(self) -> "CampaignConfig":
-        if self.learner.network.pinch_profile and not self.collection.camera.keep_depth:
-            raise ValueError("learner.network.pinch_profile needs collection.camera.keep_depth; set both or none")
-        return self
-
     @field_validator("start_from")
     @classmethod
     def _found_from_anywhere(cls, source: str | None) -> str | None:

@@ -14,7 +14,7 @@ class EvaluateSettings(ObjectSelection):
     task: str | None = None
     """Another task than the policy's, of the same primitive."""
     methods: tuple[MethodName, ...] = ()
-    """The methods; default: all whose networks are trained."""
+    """The methods; default: all of the paper's, and of packages, whose networks are trained."""
     budgets: tuple[Budget, ...] = Field((1, 2, 4), min_length=1)
     """Numbers of interactions after which methods are evaluated."""
     trials: int = Field(10, ge=1, le=100_000)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from adaafford.pretrained import load_policy, pretrained_names
+from adaafford.pretrained import load_policy
 from cluster.config.campaign_config import CampaignConfig
 from cluster.config.evaluation_settings import EvaluateSettings
 from cluster.config.objects import objects_for
@@ -26,7 +26,7 @@ from shared.errors import UsageError
 from shared.io.text import plain
 from shared.plan import EvaluationConfig, ObjectRef, Setting
 from shared.policies.methods import METHODS, MethodName
-from shared.policies.policy import WEIGHTS_FILE, Policy
+from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.store import Store
 from shared.tasks import TASKS, Task, task_named
 
@@ -112,7 +112,9 @@ def evaluate_without_run(source: str, settings: EvaluateSettings, out: Path | No
     Raises:
         AdaAffordError: there is none, the objects or methods do not suit, or a worker failed.
     """
-    if source not in pretrained_names() and RunFolder(Path(source)).config.is_file():
+    place = folder_of(source)
+    # What a training leaves beside a policy has the name of a run's configuration.
+    if not (place / POLICY_FILE).is_file() and RunFolder(Path(source)).config.is_file():
         evaluate_run(Path(source), settings, out)
         return
     policy = load_policy(source)
@@ -134,14 +136,13 @@ def evaluate_without_run(source: str, settings: EvaluateSettings, out: Path | No
     if not (seen := seen_by(source)):
         Console(file=sys.stderr, highlight=False).print(f"policy {unknown(source)}", markup=False, soft_wrap=True)
     refs, folder = _objects(task, settings, settings.objects, lambda ref: ref.content_hash not in seen)
-    files = policy.to_files()
-    place = folder_of(source)
+    needs_depth, files = policy.config.pinch_profile, policy.to_files()
     subject = _Subject(
         policy=policy,
         files=lambda version: files,
         version=ONLY_VERSION,
         methods=methods,
-        collection=settings.collection,
+        collection=settings.collection.keeping_depth() if needs_depth else settings.collection,
         oracle=place,
         root=None,
         evaluations=EVALUATIONS,
@@ -239,8 +240,11 @@ def _objects(
 
 
 def _possible_methods(policy: Policy) -> tuple[MethodName, ...]:
-    """The methods whose networks are trained."""
-    return tuple(name for name in METHODS.names() if policy.trained.issuperset(METHODS.get(name).modules))
+    """The methods whose networks are trained, without those that somebody has to name."""
+    known = {name: METHODS.get(name) for name in METHODS.names()}
+    return tuple(
+        name for name, method in known.items() if policy.trained.issuperset(method.modules) and not method.reference
+    )
 
 
 def _default_out(evaluations: Path, label: str, identity: str, setting: Setting, folder: Path) -> Path:

@@ -11,6 +11,7 @@ SUCCESS, FAILURE, PROPOSED = "#148a3d", "#d11f2f", "#111111"
 COLOURS = {
     "ours-final": ACCENT,
     "ours-no-iteration": "#e07b39",
+    "ours-value": "#c9a227",
     "ours-fps": SECOND,
     "ours-argfps": "#63a4d9",
     "ours-purefps": "#9cc3e6",

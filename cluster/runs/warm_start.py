@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 
 from adaafford.pretrained import PRETRAINED_FOLDER, load_policy, pretrained_names
+from cluster.config.campaign_config import CampaignConfig
 from cluster.runs.run_folder import RunFolder
 from learner.stages.jobs import DONE_FILE, objects_seen
 from learner.stages.trainers import ORACLE_FILE
@@ -43,6 +44,18 @@ def fit_to_start_from(source: str, task: str) -> Policy:
         raise UsageError(f"start_from '{source}': a policy for '{policy.task}', but the run is of '{task}'")
     policy.require("prior", "aap", "aip")
     return policy
+
+
+def with_needed_depth(config: CampaignConfig) -> CampaignConfig:
+    """A campaign that keeps depth images where its networks need them.
+
+    Raises:
+        UsageError: its camera cannot keep them, or there is no policy to start from.
+    """
+    learned = config.learner.network.pinch_profile
+    if config.start_from is not None:
+        learned = fit_to_start_from(config.start_from, config.task).config.pinch_profile
+    return config.model_copy(update={"collection": config.collection.keeping_depth()}) if learned else config
 
 
 def folder_of(source: str) -> Path:

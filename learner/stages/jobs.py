@@ -296,6 +296,10 @@ def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Polic
     policy = read_policy_folder(job.init)
     if policy.task != task:
         raise UsageError(f"{job.init}: a policy for '{policy.task}', but the store is of '{task}'; use one of its task")
+    told, has = config.network, policy.config
+    if job.stage == "prior" and (told.pinch_profile > has.pinch_profile or told.roll_symmetry > has.roll_symmetry):
+        profile, symmetry = has.pinch_profile or told.pinch_profile, has.roll_symmetry or told.roll_symmetry
+        policy = policy.with_pinch(profile, symmetry, torch_seed(config.seed, "learner.weights") % 2**32)
     policy.require(*needed(job.stage))
     if job.stage in BASELINES.names():
         policy.begin_baseline(job.stage, torch_seed(config.seed, f"learner.{job.stage}.weights") % 2**32)

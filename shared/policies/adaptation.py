@@ -84,12 +84,45 @@ class Adapter:
     @torch.inference_mode()
     def z(self, history: Sequence[Interaction], module: ModuleName = "aap") -> Tensor:
         """The hidden information z of a history in any order, [latent_width]; the history may be empty."""
-        latent = self.policy.config.latent_width
-        codes, weights = torch.zeros(0, latent), torch.zeros(0)
-        if history:
-            parts = [self._interaction_code(interaction, module) for interaction in history]
-            codes, weights = torch.cat([code for code, _ in parts]), torch.cat([weight for _, weight in parts])
-        return self._adaptive(module).latent(codes, weights)
+        return self._adaptive(module).latent(*self._history_codes(history, module))
+
+    @torch.inference_mode()
+    def imagined(
+        self,
+        observation: Observation,
+        points: NDArray[np.int64],
+        frames: Tensor,
+        outcome: tuple[float, bool],
+        history: Sequence[Interaction],
+    ) -> Tensor:
+        """The z of a history and one imagined interaction, for each of some actions, [A, latent_width].
+
+        Args:
+            observation: of the imagined interactions.
+            points: indices of the actions' points, [A].
+            frames: of the actions, as `frames` gives them, [A, 6 or more].
+            outcome: m and r of the imagined interactions; what else an outcome tells is unknown.
+            history: interactions that were executed.
+        """
+        motions = torch.full((len(points),), outcome[0])
+        codes, weights = self.policy.aap.interaction_codes(
+            self.features(observation, "aap", points),
+            self.places(observation, points),
+            frames,
+            motions,
+            torch.full_like(motions, float(outcome[1])),
+        )
+        known, known_weights = self._history_codes(history, "aap")
+        return self.policy.aap.prefix_latents(
+            torch.cat([known.expand(len(points), -1, -1), codes[:, None]], dim=1),
+            torch.cat([known_weights.expand(len(points), -1), weights[:, None]], dim=1),
+        )[:, -1]
+
+    @torch.inference_mode()
+    def beliefs(self, observation: Observation, points: NDArray[np.int64], frames: Tensor, latents: Tensor) -> Tensor:
+        """The AAP scores s_u|z of the actions that `imagined` describes, under each of some z, [Z, A]."""
+        features, places = self.features(observation, "aap", points), self.places(observation, points)
+        return torch.sigmoid(self.policy.aap.action_logits(features, places, frames, latents[:, None]))
 
     @torch.inference_mode()
     def affordance(
@@ -238,6 +271,13 @@ class Adapter:
                 return self.policy.aip.encoder
             case _:
                 return self._adaptive(module).encoder
+
+    def _history_codes(self, history: Sequence[Interaction], module: ModuleName) -> tuple[Tensor, Tensor]:
+        """Codes, [K, latent_width], and attention weights, [K], of interactions."""
+        if not history:
+            return torch.zeros(0, self.policy.config.latent_width), torch.zeros(0)
+        parts = [self._interaction_code(interaction, module) for interaction in history]
+        return torch.cat([code for code, _ in parts]), torch.cat([weight for _, weight in parts])
 
     def _interaction_code(self, interaction: Interaction, module: ModuleName) -> tuple[Tensor, Tensor]:
         index, outcome = np.array([interaction.action.point_index]), interaction.outcome

@@ -79,6 +79,7 @@ PROPOSERS = Registry(
     ProposerKind,
     {
         "aip": "shared.policies.proposers:AIP",
+        "information-value": "shared.policies.information_value:INFORMATION_VALUE",
         "fps": "shared.policies.fps:FPS",
         "purefps": "shared.policies.fps:PURE_FPS",
         "argfps": "shared.policies.fps:WEIGHTED_FPS",
@@ -104,12 +105,14 @@ class Method:
         critic: the critic that is evaluated and chooses the final action.
         in_one_shot: the fixed number of interactions, independent of the budget; None: the budget.
         version: the policy version that it uses; None: the one that is evaluated.
+        reference: whether it is compared only where an evaluation names it, because the paper does not have it.
     """
 
     tries: Name | None
     critic: CriticName
     in_one_shot: int | None = None
     version: int | None = None
+    reference: bool = False
 
     def budgets(self, wanted: Sequence[int]) -> list[int]:
         """The numbers of interactions after which it is evaluated, ascending."""
@@ -145,9 +148,10 @@ METHODS: Registry[Method] = Registry(
         "ours-fps": Method("fps", "aap"),
         "ours-no-iteration": Method("aip", "aap", version=FIRST_VERSION),
         "ours-final": Method("aip", "aap"),
+        "ours-value": Method("information-value", "aap", reference=True),
     },
 )
-"""In the order of the paper's table."""
+"""In the order of the paper's table, then what it does not have."""
 
 
 def method_named(name: MethodName) -> Method:

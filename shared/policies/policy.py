@@ -99,6 +99,27 @@ class Policy:
         assert isinstance(network, kind), f"{name} is no {kind.__name__}"
         return network
 
+    def with_pinch(self, profile: bool, symmetry: bool, seed: int) -> "Policy":
+        """An untrained policy that begins with these weights, and also with what a configuration may have of fingers.
+
+        What profiles say counts for nothing at first: their last weights are zero. Without the symmetry, all networks
+        therefore begin as the same functions.
+
+        Args:
+            profile: whether actions are given pinch profiles.
+            symmetry: whether both rolls of a gripper are encoded alike.
+            seed: of the other weights of the profiles' encoders.
+        """
+        config = self.config.model_copy(update={"pinch_profile": profile, "roll_symmetry": symmetry})
+        begun = Policy.untrained(self.task, config, seed)
+        weights, known = begun.modules().state_dict(), self.without_baselines().modules().state_dict()
+        for name, weight in weights.items():
+            if name in known:
+                weight.copy_(known[name])
+            elif ".pinch.second." in name:
+                weight.zero_()
+        return begun
+
     def modules(self) -> nn.ModuleDict:
         """The modules that there are, by name."""
         return nn.ModuleDict({"prior": self.prior, "aap": self.aap, "aip": self.aip, **self.baselines})

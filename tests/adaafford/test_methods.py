@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,13 +11,15 @@ import torch
 from numpy.typing import NDArray
 from pydantic import ValidationError
 from safetensors.torch import load, save
+from torch import Tensor
 
 from cluster.cli.commands.run import main as run_command
 from shared.errors import StoreError, UsageError
 from shared.plan import EvaluationConfig
-from shared.policies.adaptation import Adapter, frames_in_view, movable_points
+from shared.policies.adaptation import Adapter, action_from_frame, frames_in_view, movable_points, point_indices
 from shared.policies.critics import Critic, critic_named
 from shared.policies.fps import LEAST_POINTS, THRESHOLD, FpsProposer, actionable_points, distances_to
+from shared.policies.information_value import BEST, CANDIDATES, USUAL_MOTION
 from shared.policies.methods import (
     METHODS,
     BaselineName,
@@ -206,6 +209,53 @@ def test_weighted_distance_begins_at_the_top_and_weighs_both(adapter: Adapter) -
     proposer = proposer_named("argfps", adapter, np.random.default_rng(0), 1)
     assert isinstance(proposer, FpsProposer)
     assert proposer.choose(np.array([1.0, 2.0, 3.0]), np.array([0.9, 0.8, 0.1], np.float32)) == 1
+
+
+def test_imagined_interactions_are_read_as_if_they_had_happened(adapter: Adapter) -> None:
+    observation = observation_of()
+    history, actions = history_of(observation, 2), actions_of(observation, 3)
+    points, frames = point_indices(actions), adapter.frames(observation, actions)
+    for before in ([], history):
+        for motion, success in ((0.0, False), (0.05, True)):
+            latents = adapter.imagined(observation, points, frames, (motion, success), before)
+            beliefs = adapter.beliefs(observation, points, frames, latents)
+            for action, latent, believed in zip(actions, latents, beliefs, strict=True):
+                after = [*before, Interaction(observation, action, Outcome(OutcomeKind.OK, motion, success))]
+                torch.testing.assert_close(latent, adapter.z(after))
+                np.testing.assert_allclose(believed, adapter.score(observation, actions, after), rtol=1e-4)
+
+
+def test_the_action_with_the_highest_value_of_information_is_proposed(
+    adapter: Adapter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    observation, compared = observation_of(), list[list[Action]]()
+    history = history_of(observation, 2)
+
+    imagined = Adapter.imagined
+
+    def spied(self: Adapter, seen: Observation, points: NDArray[np.int64], frames: Tensor, *rest: Any) -> Tensor:
+        compared.append([action_from_frame(seen, int(p), frame) for p, frame in zip(points, frames, strict=True)])
+        return imagined(self, seen, points, frames, *rest)
+
+    monkeypatch.setattr(Adapter, "imagined", spied)
+    proposed = proposer_named("information-value", adapter, np.random.default_rng(0), 4).propose(observation, history)
+    assert proposed is not None
+    actions = compared[0]
+    assert len({action.point_index for action in actions}) == len(actions)
+    assert len(actions) == min(CANDIDATES, len(movable_points(observation)))
+    motion = float(np.median([i.outcome.motion for i in history if i.outcome.success] or [USUAL_MOTION]))
+
+    def value(action: Action) -> float:
+        odds = float(adapter.score(observation, [action], history)[0])
+        best = [
+            np.sort(adapter.score(observation, actions, [*history, Interaction(observation, action, outcome)]))[-BEST:]
+            for outcome in (Outcome(OutcomeKind.OK, motion, True), Outcome(OutcomeKind.OK, 0.0, False))
+        ]
+        return float(odds * best[0].mean() + (1 - odds) * best[1].mean())
+
+    values = [value(action) for action in actions]
+    chosen = next(k for k, action in enumerate(actions) if action.point_index == proposed.point_index)
+    assert values[chosen] == pytest.approx(max(values), abs=1e-5)
 
 
 def test_an_unknown_proposer_is_refused_with_those_there_are(adapter: Adapter) -> None:

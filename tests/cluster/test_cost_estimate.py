@@ -16,6 +16,7 @@ from learner.alternation import Publish
 from shared.networks.network_config import NETWORKS
 from shared.policies.methods import METHODS
 
+KEEP = "--collection.camera.keep-depth"
 RATE_VALUES = {name: rate for name, rate in dataclasses.asdict(RATES).items() if name != "measured"}
 
 
@@ -51,7 +52,7 @@ def test_the_published_scale_is_the_published_one() -> None:
     train, validation, test = found.objects
     assert train + validation + test == pytest.approx(972, abs=5)
     assert stage(found, "collect-random").interactions == (train + validation) * 4 * 32
-    assert set(config.evaluation.methods) == set(METHODS.names())
+    assert set(config.evaluation.methods) == {name for name in METHODS.names() if not METHODS.get(name).reference}
     assert config.learner.network == NETWORKS["published"]
     assert stage(found, "evaluate").interactions % (10 * test) == 0
 
@@ -86,6 +87,34 @@ def test_rates_are_of_their_stages_alone() -> None:
     before, after = estimate(config), estimate(config, slow)
     changed = [one.stage for one, two in zip(before.stages, after.stages, strict=True) if one != two]
     assert changed == ["collect-random", "collect-aip-1", "evaluate"]
+
+
+def test_depth_images_cost_time_and_disk_where_they_are_kept() -> None:
+    kept = {"camera": {"keep_depth": True}}
+    without = estimate(CampaignConfig())
+    stored = estimate(CampaignConfig.model_validate({"collection": kept}))
+    profiled = estimate(
+        CampaignConfig.model_validate({"collection": kept, "learner": {"network": {"pinch_profile": True}}})
+    )
+    clouds = CampaignConfig().rollouts.random * CampaignConfig().collection.rollout.interactions
+    added = stage(stored, "collect-random").size_bytes - stage(without, "collect-random").size_bytes
+    assert 0 < added <= clouds * 448**2 * RATES.depth_pixel_bytes
+    for name in ("collect-random", "collect-aip-1", "evaluate"):
+        assert stage(stored, name).core_s > stage(without, name).core_s
+    for name in ("train-prior", "train-aap-1", "train-aip-1", "train-aap-2", "evaluate"):
+        assert stage(profiled, name).core_s > stage(stored, name).core_s
+    larger = {"camera": {"keep_depth": True, "image_size": 896}}
+    doubled = estimate(CampaignConfig.model_validate({"collection": larger}))
+    assert stage(doubled, "evaluate").size_bytes > stage(stored, "evaluate").size_bytes
+
+
+def test_a_dry_run_counts_the_depth_images_that_a_policy_needs(capsys: pytest.CaptureFixture[str]) -> None:
+    said = []
+    for flags in (["--learner.network.pinch-profile"], ["--learner.network.pinch-profile", KEEP], [KEEP], []):
+        assert adaafford(["run", "--dry-run", *flags]) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1]
+    assert len(set(said)) == 3
 
 
 def test_larger_networks_and_clouds_cost_more() -> None:

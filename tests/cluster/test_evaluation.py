@@ -6,6 +6,7 @@ import io
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,8 @@ from collector.worker import Worker
 from learner.evaluation.bootstrap import ratio_interval
 from learner.evaluation.table import EvaluationRow, ObjectCounts
 from learner.metrics import f_score
-from learner.stages.jobs import DONE_FILE
+from learner.settings import LearnerConfig
+from learner.stages.jobs import CONFIG_FILE, DONE_FILE
 from shared.errors import UsageError
 from shared.formatting import csv_table
 from shared.plan import EvaluationConfig, Plan, Setting
@@ -226,6 +228,17 @@ def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_evaluate_policy_takes_the_folder_of_a_training(
+    finished: Path, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda subject, *_: told.append(subject))
+    stage = shutil.copytree(exported, tmp_path / "stage")
+    (stage / CONFIG_FILE).write_text(LearnerConfig().model_dump_json())
+    evaluate_without_run(str(stage), FAST.model_copy(update={"objects": finished / "objects"}), None)
+    assert [subject.label for subject in told] == ["stage"]
+
+
 @pytest.mark.parametrize("named", ["folder", "file"])
 def test_evaluate_policy_without_run_tests_all_objects_but_those_it_has_seen(
     named: str, finished: Path, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -250,9 +263,10 @@ def test_evaluate_policy_without_run_tests_all_objects_but_those_it_has_seen(
     assert one.out.parent == Path("evaluations")
     assert one.out.name.startswith("push-faucet-objects-policy-")
     # The first policy of the run is not known, so the method that uses it is left out.
-    assert set(one.config.methods) == {"where2act", *(name for name in METHODS.names() if name.startswith("ours-"))} - {
-        "ours-no-iteration"
-    }
+    # A reference is compared only where it is named.
+    left_out = {"ours-no-iteration", "ours-value"}
+    ours = {name for name in METHODS.names() if name.startswith("ours-")}
+    assert set(one.config.methods) == ({"where2act"} | ours) - left_out
 
 
 def test_evaluate_policy_says_where_its_objects_cannot_be_known(
@@ -265,6 +279,22 @@ def test_evaluate_policy_says_where_its_objects_cannot_be_known(
     for source, said in ((lone, 1), (exported, 0)):
         evaluate_without_run(str(source), FAST.model_copy(update={"objects": finished / "objects"}), None)
         assert capsys.readouterr().err.count("has no record of its training objects") == said
+
+
+def test_evaluate_policy_keeps_depth_images_where_its_networks_need_them(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda subject, *_: told.append(subject))
+    for needed in (False, True):
+        policy = Policy.untrained("push", SMALL_NETWORK.model_copy(update={"pinch_profile": needed}), 0)
+        folder = tmp_path / str(needed)
+        folder.mkdir()
+        for name, data in policy.with_trained("prior").to_files().items():
+            (folder / name).write_bytes(data)
+        evaluate_without_run(str(folder), FAST.model_copy(update={"objects": finished / "objects"}), None)
+    assert [subject.collection.camera.keep_depth for subject in told] == [False, True]
+    assert told[1].collection == told[0].collection.keeping_depth()
 
 
 def test_evaluate_policy_with_a_run_is_the_evaluation_of_the_run(

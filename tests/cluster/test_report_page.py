@@ -327,6 +327,8 @@ def test_texts_are_one_line_of_bounded_length() -> None:
 def test_the_paper_has_figures_for_every_task_and_method() -> None:
     for task in TASKS.names():
         for method in METHODS.names():
+            if METHODS.get(method).reference:
+                continue
             told = published(task, novel_categories=False)[method]
             assert all(0 < (told.at(budget, "f_score") or 0) < 100 for budget in (1, 2, 4))
             assert told.at(3, "f_score") is None or len(told.f_score) == 1

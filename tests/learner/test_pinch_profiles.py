@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from cluster.config.campaign_config import CampaignConfig
+from cluster.runs.warm_start import with_needed_depth
 from learner.data.augmentation import draw_flips
 from learner.data.dataset import load_dataset
 from learner.data.features import FrozenFeatures, ProposalPool
 from learner.settings import AugmentationConfig, LearnerConfig
 from learner.stages.jobs import StageJob, run_stage
-from shared.config import CameraConfig
+from shared.config import CameraConfig, CollectionConfig
 from shared.errors import UsageError
 from shared.networks.actions import FRAME_WIDTH
 from shared.pinch import BINS, PROFILE_WIDTH
@@ -104,6 +105,29 @@ def test_all_stages_learn_with_profiles_and_the_policy_proposes(store: Store, tm
         Adapter(again).frames(dataclasses.replace(seen, dense=None), [record.interactions[0].action])
 
 
+def test_a_policy_gets_pinch_profiles_and_begins_as_the_same_functions(store: Store, tmp_path: Path) -> None:
+    old = policy_of(TINY, seed=3)
+    for name, data in old.to_files().items():
+        (tmp_path / name).write_bytes(data)
+    wider, symmetric = old.with_pinch(True, False, 1), old.with_pinch(True, True, 1)
+    assert wider.config == TOLD
+    assert symmetric.config == TOLD.model_copy(update={"roll_symmetry": True})
+    assert not wider.trained
+    record = store.read_rollouts(store.jobs()[0].shard_id)[0]
+    seen, actions = record.observations[0], [one.action for one in record.interactions]
+    history = [Interaction(seen, one.action, one.outcome) for one in record.interactions[:2]]
+    before, after = Adapter(old), Adapter(wider)
+    np.testing.assert_allclose(after.score(seen, actions, history), before.score(seen, actions, history), rtol=1e-5)
+    np.testing.assert_allclose(after.prior_score(seen, actions), before.prior_score(seen, actions), rtol=1e-5)
+    config = FAST.model_copy(update={"network": TOLD})
+    trained = run_stage(StageJob("prior", store.where, tmp_path / "prior", tmp_path), config)
+    assert trained.config == TOLD
+    assert trained.trained == {"prior"}
+    kept = run_stage(StageJob("prior", store.where, tmp_path / "kept", tmp_path), FAST)
+    assert kept.config == TINY
+    assert kept.trained == old.trained
+
+
 def test_a_policy_is_not_used_where_no_depth_image_is_kept() -> None:
     policy_of(TINY).check_camera(CameraConfig())
     policy_of(TOLD).check_camera(CameraConfig(keep_depth=True))
@@ -111,12 +135,27 @@ def test_a_policy_is_not_used_where_no_depth_image_is_kept() -> None:
         policy_of(TOLD).check_camera(CameraConfig())
 
 
-def test_a_campaign_keeps_the_depth_images_that_it_learns_from() -> None:
+def test_a_campaign_keeps_the_depth_images_that_its_networks_need(tmp_path: Path) -> None:
     learner = {"network": {"pinch_profile": True}}
-    with pytest.raises(ValueError, match=r"pinch_profile needs collection\.camera\.keep_depth"):
-        CampaignConfig.model_validate({"learner": learner})
-    kept = {"camera": {"keep_depth": True}}
-    assert CampaignConfig.model_validate({"learner": learner, "collection": kept}).learner.network.pinch_profile
+    config = CampaignConfig.model_validate({"learner": learner})
+    kept = with_needed_depth(config)
+    assert kept == with_needed_depth(kept)
+    assert kept.model_dump() == config.model_dump() | {"collection": kept.collection.model_dump()}
+    assert kept.collection == CollectionConfig(camera=CameraConfig(keep_depth=True))
+    assert with_needed_depth(CampaignConfig()) == CampaignConfig()
+    for networks, name in ((TINY, "plain"), (TOLD, "told")):
+        (tmp_path / name).mkdir()
+        for file, data in policy_of(networks).to_files().items():
+            (tmp_path / name / file).write_bytes(data)
+    for source, needed in (("plain", False), ("told", True)):
+        # The policy decides, and not the networks that would be trained from nothing.
+        started = CampaignConfig.model_validate(
+            {"learner": learner, "start_from": str(tmp_path / source), "task": "push"}
+        )
+        assert with_needed_depth(started).collection.camera.keep_depth == needed
+    large = {"learner": learner, "collection": {"camera": {"image_size": 4096}}}
+    with pytest.raises(UsageError, match=r"collection\.camera.*keep_depth needs an image_size of at most"):
+        with_needed_depth(CampaignConfig.model_validate(large))
 
 
 def test_flips_are_drawn_only_where_they_are_asked_for() -> None:

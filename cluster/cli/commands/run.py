@@ -43,15 +43,18 @@ def main(args: list[str]) -> int:
         from learner.stages.trainers import check_baselines
 
         check_baselines(command.settings.learner)
+    from cluster.runs.warm_start import with_needed_depth
+
+    settings = with_needed_depth(command.settings)
     if command.dry_run:
         from cluster.campaign.estimate import RATES, estimate, print_estimate
 
-        print_estimate(estimate(command.settings), command.settings.workers, RATES)
+        print_estimate(estimate(settings), settings.workers, RATES)
         return 0
     if command.out is None:
         raise UsageError("run needs --out FOLDER, or --dry-run to say what it will cost")
     from cluster.campaign.campaign import Campaign
     from cluster.runs.run_folder import begin
 
-    Campaign(begin(command.out, command.settings), command.settings).execute()
+    Campaign(begin(command.out, settings), settings).execute()
     return 0

@@ -59,7 +59,9 @@ class TrainCommand(LearnerCommand):
     """Train networks from a finished store. Give the same command again to continue."""
 
     init: Path | None = None
-    """The --out of the previous stage, whose networks are the start."""
+    """The --out of the previous stage, whose networks are the start. The prior, and an alternation, may start from any
+    policy; if --network.pinch-profile or --network.roll-symmetry is set and it lacks it, AAP and AIP are trained anew
+    from its weights."""
 
 
 Command = TypeVar("Command", bound=LearnerCommand)
