@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from cluster.cli.main import run
+from shared.config import Fidelity
 from shared.errors import SchemaVersionError, StoreError, UsageError
 from shared.plan import Job, Plan
 from shared.records import RolloutStatus
@@ -136,6 +137,8 @@ def test_a_store_of_the_first_version_is_collected_into_trained_from_and_exporte
     store = Store.open(where)
     assert len(store.rollouts()) == 10
     assert verify(store) == []
+    assert store.setting.collection.fidelity == Fidelity()
+    assert "begun with fidelity version 1; it goes on with that" in caplog.text
     learner = tmp_path / "learner.toml"
     learner.write_text((old / "run/training/prior/learner.toml").read_text())
     assert run(["train", "prior", "--store", str(where), "--out", str(tmp_path / "out"), "--config", str(learner)]) == 0
