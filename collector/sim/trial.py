@@ -24,9 +24,12 @@ hand's drives (24 steps of the fast approach, 48 of its drag) less than 0.6 mm i
 FOLLOWED_MOTION = 5e-5
 """A hold that another motion follows may end earlier from fidelity version 2: when no coordinate of the hand changed by
 more than this a step. What is left to come of it comes during that motion."""
-MOST_AHEAD, HAND_YIELDS, JOINT_YIELDS = 8, 0.3, 3e-6
-"""From fidelity version 2, the target of a hand moves up to this many steps of its leg at once, which press 1.7 N more,
-while the hand moves by less than the second times what its target moves, and no joint by more than the third a step."""
+PREPARING, DECISIVE = (16, 0.4), (4, 0.2)
+"""From fidelity version 2: how many steps of its leg the target of a hand moves at once, at most, while the hand moves
+by less than the second times what its target moves. First for a leg that another one follows, where each time step adds
+3.3 N or less; then for the last, which decides, with 0.8 N."""
+JOINT_YIELDS = 3e-6
+"""And while no joint moves by more than this a step."""
 FIRST_STEP = Timing(steps_per_second=PUBLISHED_TIMING.steps_per_second, leg_steps=500, hold_steps=0)
 """From fidelity version 2, at the pace of the fast approach: how hard overlapping shapes press in a step depends on its
 length, and so does which overlap is a start collision."""
@@ -187,11 +190,14 @@ class Trial:
         moved, span = np.abs(now - before[1]), self.steps - before[0]
         joints = len(self.scene.joints)
         stride = float(np.linalg.norm(path[1, :3] - path[0, :3]))
-        gives = (
-            moved[joints:].max(initial=0.0) >= HAND_YIELDS * stride * ahead * span
+        prepares = self._timing is self.fidelity.approach and self.primitive.then is not None
+        most, share = PREPARING if prepares else DECISIVE
+        if (
+            moved[joints:].max(initial=0.0) >= share * stride * ahead * span
             or moved[:joints].max() >= JOINT_YIELDS * span
-        )
-        return 1 if gives else min(2 * ahead, MOST_AHEAD)
+        ):
+            return 1
+        return min(2 * ahead, most)
 
     def _object_rests(self) -> bool:
         """Whether no joint has moved since this was asked last, `REST_STEPS` ago or more."""
