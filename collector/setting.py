@@ -1,15 +1,19 @@
 """Complete settings, with the packages that they need."""
 
+import logging
 from typing import Any
 
 from collector.sim.grippers import GRIPPERS
 from collector.sim.simulator import SIMULATORS
-from shared.config import CollectionConfig
-from shared.errors import UsageError
+from shared.config import FIDELITIES, CollectionConfig, Fidelity
+from shared.errors import StoreError, UsageError
 from shared.extensions import added_by_packages
 from shared.plan import EvaluationConfig, Setting, found_by_name
 from shared.primitives import PRIMITIVES
+from shared.store import Store
 from shared.tasks import TASKS, Task
+
+logger = logging.getLogger(__name__)
 
 
 def make_setting(
@@ -66,3 +70,17 @@ def check_packages(setting: Setting) -> None:
     if here != setting.extensions:
         wanted, found = ("; ".join(packages) or "no package" for packages in (setting.extensions, here))
         raise UsageError(f"the store is of {wanted}, but here is {found}; install the same on every machine")
+
+
+def in_fidelity_of(where: str, collection: CollectionConfig) -> CollectionConfig:
+    """`collection`, which asks for the default fidelity, in the one that was the default when a store was begun."""
+    if collection.fidelity != FIDELITIES["fast"]:
+        return collection
+    try:
+        begun = Store.open(where).setting.collection.fidelity
+    except StoreError:  # There is none yet, or what is wrong with it is said when it is made.
+        return collection
+    if begun != Fidelity():
+        return collection
+    logger.warning("%s: was begun with fidelity version %d; it goes on with that", where, begun.version)
+    return collection.model_copy(update={"fidelity": begun})

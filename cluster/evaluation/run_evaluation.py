@@ -19,7 +19,7 @@ from cluster.evaluation.tables import MARKDOWN_FILE, RESULTS_FILE
 from cluster.runs.run_folder import RunFolder, find
 from cluster.runs.warm_start import folder_of, seen_by, unknown
 from cluster.workers.session import Crew, worker_groups
-from collector.setting import make_setting
+from collector.setting import in_fidelity_of, make_setting
 from collector.watchdog import Limits
 from shared.config import CollectionConfig
 from shared.errors import UsageError
@@ -164,7 +164,7 @@ def _evaluate(
     """Do what is left of the trials on objects of a folder, and print the table."""
     setting = make_setting(
         task,
-        subject.collection,
+        subject.collection if out is None else in_fidelity_of(str(out / "store"), subject.collection),
         kind="evaluation",
         seed=seed if settings.seed is None else settings.seed,
         objects=refs,

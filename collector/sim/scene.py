@@ -24,6 +24,9 @@ CONTACT_FORCE = 5.0
 """N. The published rule counts contact points with a squared impulse above 1e-4; at its 1/500 s that is this force."""
 CONTACT_RANGE = 0.02
 """The engine lists pairs that are closer than this: the sum of two shapes' contact offsets."""
+PART_RANGE = 0.004
+"""Two parts of the object, from fidelity version 2. Parts of closed furniture are close to each other throughout, and
+listing them takes more time than all else. Between parts and hand the range stays `CONTACT_RANGE`."""
 TOUCHING = 1e-3
 """Pairs further apart exert no force: until it touches something, the hand moves by a tenth of this a step. (Each force
 that is read costs as much as the rest of its pair.)"""
@@ -94,6 +97,8 @@ class Scene:
         self.gripper = GRIPPERS.get(gripper).build(self._scene, self._material, fidelity.jointed_hand)
         self._hand = {self.gripper.palm, *self.gripper.fingers}
         self._fidelity = fidelity
+        if fidelity.version > 1:
+            self._shorten_ranges()
         self._impulse_squared = 0.0
         self.limits = target.limits()
         self.park()
@@ -107,6 +112,13 @@ class Scene:
     def joints(self) -> list[physx.PhysxArticulationJoint]:
         """SAPIEN's joints of the movable parts, in part order."""
         return self._joints
+
+    def _shorten_ranges(self) -> None:
+        """Give parts of the object `PART_RANGE` among themselves, and the hand what is missing to `CONTACT_RANGE`."""
+        own = PART_RANGE / 2
+        for links, offset in ((self._links, own), (self._hand, CONTACT_RANGE - own)):
+            for shape in (shape for link in links for shape in link.collision_shapes):
+                shape.contact_offset = offset
 
     def set_part_mass(self, mass: float) -> None:
         """Set the mass of every movable part, kg, and scale its inertia."""

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from collector.sim.gripper import still
+from collector.sim.gripper import GRASP_OPENING, still
 from collector.sim.scene import Scene
-from shared.config import Fidelity
+from shared.config import PUBLISHED_TIMING, Fidelity, Timing
 from shared.primitives import START_DISTANCE, Leg, PrimitiveSpec, hand_start
 from shared.types import Action, Float, Outcome, OutcomeKind
 
@@ -21,6 +21,18 @@ LEAST_SKIP = 4
 REST_STEPS, REST_MOTION = 8, 1.2e-5
 """A hold may end when hand and object moved by less than the second a step over the first; at the time constant of the
 hand's drives (24 steps of the fast approach, 48 of its drag) less than 0.6 mm is then left to come."""
+FOLLOWED_MOTION = 5e-5
+"""A hold that another motion follows may end earlier from fidelity version 2: when no coordinate of the hand changed by
+more than this a step. What is left to come of it comes during that motion."""
+PREPARING, DECISIVE = (16, 0.4), (4, 0.2)
+"""From fidelity version 2: how many steps of its leg the target of a hand moves at once, at most, while the hand moves
+by less than the second times what its target moves. First for a leg that another one follows, where each time step adds
+3.3 N or less; then for the last, which decides, with 0.8 N."""
+JOINT_YIELDS = 3e-6
+"""And while no joint moves by more than this a step."""
+FIRST_STEP = Timing(steps_per_second=PUBLISHED_TIMING.steps_per_second, leg_steps=500, hold_steps=0)
+"""From fidelity version 2, at the pace of the fast approach: how hard overlapping shapes press in a step depends on its
+length, and so does which overlap is a start collision."""
 SANE_POSITION = 1e3
 """A joint position beyond this means that the simulation diverged."""
 
@@ -61,7 +73,9 @@ class Trial:
         self._brushed = False
         self._timing = fidelity.approach
         self._clearance = 0.0
+        self._grasps = False
         self._positions = np.full(1, np.nan)
+        self._stood: tuple[int, Float] | None = None
         self._hand_at = still()
         self._opening = float("nan")
 
@@ -75,7 +89,7 @@ class Trial:
         scene.gripper.place(self.action.rotation, hand_start(self.action), opened=self.primitive.closes_fingers)
         try:
             self._execute()
-            kind = OutcomeKind.OK if self._brushed else OutcomeKind.NO_CONTACT
+            kind = self._kind()
         except _TrialEndedError as ended:
             kind = ended.kind
         if kind is OutcomeKind.START_COLLISION:
@@ -107,6 +121,7 @@ class Trial:
             self._opening = gripper.opening()
             if not gripper.holds():
                 raise _TrialEndedError(OutcomeKind.NO_GRASP)
+            self._grasps = True
         if then is not None:
             self._timing = self.fidelity.drag
             self.scene.set_timing(self._timing)
@@ -114,19 +129,27 @@ class Trial:
             self._hold(last=True)
 
     def _leg(self, end: Float) -> None:
-        """Drive the hand to `end`, [4], at constant speed."""
+        """Drive the hand to `end`, [4], at constant speed, and faster while it presses on what does not give."""
         gripper, steps = self.scene.gripper, self._timing.leg_steps
         path = np.linspace(self._hand_at, end, steps + 1)
         velocity = (end - self._hand_at) * (self._timing.steps_per_second / steps)
         gripper.drive_velocity(velocity)
-        step = 0
+        step, ahead = 0, 1
         while step < steps:
-            step += 1
+            step += ahead
             gripper.drive(path[step])
             self._step()
-            if self.fidelity.skip_free_flight and (skipped := self._free_flight(path, step)):
+            rests = self._checked and ahead == 1 and step % REST_STEPS == 0 and self._object_rests()
+            if rests and self._grasps and self.fidelity.version > 1 and not gripper.holds():
+                raise _TrialEndedError(self._kind())
+            if (
+                self.fidelity.skip_free_flight
+                and (rests or not self._checked)
+                and (skipped := self._free_flight(path, step))
+            ):
                 step += skipped
                 gripper.shift(path[step], velocity)
+            ahead = min(self._ahead(path, ahead), steps - step)
         gripper.drive(end)
         gripper.drive_velocity(still())
         self._hand_at = end
@@ -138,8 +161,6 @@ class Trial:
         anything, and only while the object rests: before the first contact, or once the hand has let go of it.
         """
         if self._checked:
-            if step % REST_STEPS or not self._object_rests():
-                return 0
             self._clearance = self.scene.contact().clearance
         stride = float(np.linalg.norm(path[1, :3] - path[0, :3]))
         # A hand that turns may come nearer than its way tells.
@@ -148,6 +169,35 @@ class Trial:
         lag = float(np.linalg.norm(path[step, :3] - self.scene.gripper.displacement()))
         ahead = min(int((self._clearance - CLEARANCE - lag) / stride), len(path) - 1 - step)
         return ahead if ahead >= LEAST_SKIP else 0
+
+    def _ahead(self, path: Float, ahead: int) -> int:
+        """How many steps of the leg along `path`, [steps + 1, 4], the target moves at the next step of the engine.
+
+        Twice as many as last time while hand and object stand still, since what holds them up then only bears more; one
+        otherwise. Every fourth step is looked at, or every one where the target moves by more.
+
+        Args:
+            path: of the hand's target.
+            ahead: how many it moved last time.
+        """
+        touched = self._checked or self._brushed
+        if self.fidelity.version < 2 or not touched or (ahead == 1 and self.steps % 4):
+            return 1
+        before, now = self._stood, self.scene.coordinates()
+        self._stood = self.steps, now
+        if before is None:
+            return 1
+        moved, span = np.abs(now - before[1]), self.steps - before[0]
+        joints = len(self.scene.joints)
+        stride = float(np.linalg.norm(path[1, :3] - path[0, :3]))
+        prepares = self._timing is self.fidelity.approach and self.primitive.then is not None
+        most, share = PREPARING if prepares else DECISIVE
+        if (
+            moved[joints:].max(initial=0.0) >= share * stride * ahead * span
+            or moved[:joints].max() >= JOINT_YIELDS * span
+        ):
+            return 1
+        return min(2 * ahead, most)
 
     def _object_rests(self) -> bool:
         """Whether no joint has moved since this was asked last, `REST_STEPS` ago or more."""
@@ -161,25 +211,48 @@ class Trial:
             closing: the fingers close; once they hold nothing, all is said.
             last: nothing comes after this hold, so that a hand which has let go of a resting object may move on.
         """
-        before = np.zeros(0)
-        for step in range(self._timing.hold_steps):
+        before, steps = np.zeros(0), self._timing.hold_steps
+        opening = float("nan")
+        for step in range(steps):
             self._step()
             if not self.fidelity.end_holds_at_rest or step % REST_STEPS:
                 continue
             if closing and not self.scene.gripper.holds():
                 return
             now = self.scene.coordinates()
-            if step and np.abs(now - before).max() < REST_STEPS * REST_MOTION:
+            opening, opened = self.scene.gripper.opening() if closing else 0.0, opening
+            if step and self._came_to_rest(now - before, last) and self._stays_open(opened, opening, steps - step):
                 return
             if last and self._object_rests() and self.scene.contact().clearance > CLEARANCE:
                 return
             before = now
 
+    def _came_to_rest(self, moved: Float, last: bool) -> bool:
+        """Whether a hold may end when `scene.coordinates` changed by `moved` in `REST_STEPS`."""
+        joints = len(self.scene.joints)
+        of_hand = REST_MOTION if last or self.fidelity.version < 2 else FOLLOWED_MOTION
+        moved = np.abs(moved) / REST_STEPS
+        return bool(moved[:joints].max() < REST_MOTION and moved[joints:].max(initial=0.0) < of_hand)
+
+    def _stays_open(self, before: float, now: float, steps: int) -> bool:
+        """Whether closing fingers still hold something if their opening goes on from `before` to `now` for `steps`."""
+        lost = (before - now) / REST_STEPS * steps
+        return self.fidelity.version < 2 or lost <= 0 or now - lost > GRASP_OPENING
+
     def _step(self) -> None:
+        first = self.steps == 0 and self.fidelity.version > 1
+        if first:
+            self.scene.set_timing(FIRST_STEP)
         self.scene.system.step()
         self.steps += 1
         if not self._checked:
             self._check_first_contact()
+        if first:
+            self.scene.set_timing(self._timing)
+
+    def _kind(self) -> OutcomeKind:
+        """Of a trial that went to its end."""
+        return OutcomeKind.OK if self._brushed else OutcomeKind.NO_CONTACT
 
     def _check_first_contact(self) -> None:
         """The published first-contact rule; checking ends with the first valid contact.

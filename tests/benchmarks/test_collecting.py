@@ -71,6 +71,11 @@ def test_f1_and_agreement_count_what_they_say() -> None:
     assert result.positive_f1 == 0.5
     assert result.positives == result.candidate_positives == 2
     assert result.motion_error_median == pytest.approx(np.median([0.1, 0.02]))
+    assert (result.near_threshold, result.near_threshold_other_labels) == (0, 0)
+    about = summarise([*pairs, pair(True, False, (0.012, 0.009)), pair(False, False, (0.009, 0.009))])
+    assert (about.near_threshold, about.near_threshold_other_labels) == (2, 1)
+    assert (about.clear_label_agreement, about.clear_positive_f1) == (0.5, 0.5)
+    assert about.label_agreement == 0.5
     assert dict(result.confusions) == {"ok success -> ok": 1, "ok -> ok success": 1}
     assert summarise([pair(False, False)]).positive_f1 == 1.0
     assert summarise([pair(True, False)]).positive_f1 == 0.0
@@ -95,6 +100,7 @@ def test_only_pairs_that_ever_succeed_can_depend_on_the_draw() -> None:
 def test_fidelity_prints_its_figures(capsys: pytest.CaptureFixture[str], objects: Path) -> None:
     found = bench(capsys, "fidelity", "--objects", str(objects), "--trials", "3", *COARSE_FLAGS)
     expected = "label_agreement positive_f1 trials positives motion_error_median reference_ms fast_ms"
+    expected += " near_threshold near_threshold_other_labels clear_label_agreement clear_positive_f1"
     assert set(expected.split()) <= found.keys()
     assert found["trials"] == 3
 

@@ -15,6 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from cluster.cli.main import run
+from collector.setting import in_fidelity_of
+from shared.config import CollectionConfig, Fidelity
 from shared.errors import SchemaVersionError, StoreError, UsageError
 from shared.plan import Job, Plan
 from shared.records import RolloutStatus
@@ -136,10 +138,23 @@ def test_a_store_of_the_first_version_is_collected_into_trained_from_and_exporte
     store = Store.open(where)
     assert len(store.rollouts()) == 10
     assert verify(store) == []
+    assert store.setting.collection.fidelity == Fidelity()
+    assert "begun with fidelity version 1; it goes on with that" in caplog.text
     learner = tmp_path / "learner.toml"
     learner.write_text((old / "run/training/prior/learner.toml").read_text())
     assert run(["train", "prior", "--store", str(where), "--out", str(tmp_path / "out"), "--config", str(learner)]) == 0
     assert run(["store", "export", str(where), "--out", str(tmp_path / "data")]) == 0
+
+
+def test_only_who_asks_for_the_default_fidelity_goes_on_with_that_of_a_store(tmp_path: Path) -> None:
+    default, first = CollectionConfig(), CollectionConfig(fidelity=Fidelity())
+    older = SETTING.model_copy(update={"collection": first})
+    for name, setting in (("newer", SETTING), ("older", older)):
+        Store.create(tmp_path / name, setting)
+    other = CollectionConfig(fidelity=Fidelity(version=2, solver_iterations=30))
+    found = [in_fidelity_of(str(tmp_path / name), default) for name in ("newer", "older", "none")]
+    assert found == [default, first, default]
+    assert in_fidelity_of(str(tmp_path / "older"), other) == other
 
 
 def test_a_run_a_policy_and_a_history_of_the_first_version_open(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from collector.domain_randomisation import draw_rollout, object_of
 from collector.objects.catalogue import load_ref
@@ -27,6 +28,8 @@ from shared.types import Action, Observation, Outcome, OutcomeKind
 
 STATES, ACTIONS = 2, 4
 """Of each rollout: states drawn, and actions tried from each. Few, so that the trials spread over many objects."""
+NEAR_THRESHOLD = 0.008, 0.015
+"""rad or length: a motion in the reference about the threshold of success, which the least difference decides."""
 EMPTY_TURNS = 4
 """Turns over all objects without a single trial, after which there is nothing to be measured."""
 
@@ -54,6 +57,10 @@ class FidelityResult:
         label_agreement: share of trials with the same success.
         positive_f1: F1 of the successes; 1 where neither has any.
         kind_agreement: share of trials with the same outcome kind.
+        near_threshold: trials whose motion in the reference is in `NEAR_THRESHOLD`.
+        near_threshold_other_labels: how many of these have another label.
+        clear_label_agreement: `label_agreement` of the others; NaN if there are none.
+        clear_positive_f1: `positive_f1` of the others.
         motion_error_median: of |m - m'| over trials in which the joint moved in the reference; NaN if none did.
         motion_error_p95: its 95th percentile.
         reference_ms: mean CPU time of a trial.
@@ -68,6 +75,10 @@ class FidelityResult:
     label_agreement: float
     positive_f1: float
     kind_agreement: float
+    near_threshold: int
+    near_threshold_other_labels: int
+    clear_label_agreement: float
+    clear_positive_f1: float
     motion_error_median: float
     motion_error_p95: float
     reference_ms: float
@@ -84,6 +95,10 @@ class FidelityResult:
             "label_agreement": self.label_agreement,
             "positive_f1": self.positive_f1,
             "kind_agreement": self.kind_agreement,
+            "near_threshold": self.near_threshold,
+            "near_threshold_other_labels": self.near_threshold_other_labels,
+            "clear_label_agreement": self.clear_label_agreement,
+            "clear_positive_f1": self.clear_positive_f1,
             "motion_error_median": self.motion_error_median,
             "motion_error_p95": self.motion_error_p95,
             "reference_ms": self.reference_ms,
@@ -129,7 +144,7 @@ def summarise(pairs: list[PairedTrial]) -> FidelityResult:
     label = np.array([pair.candidate.success for pair in pairs])
     motions = np.array([[pair.reference.motion, pair.candidate.motion] for pair in pairs])
     errors = np.abs(motions[:, 1] - motions[:, 0])[motions[:, 0] > MOTION_THRESHOLD]
-    found, positives = int((truth & label).sum()), int(truth.sum() + label.sum())
+    near = (motions[:, 0] > NEAR_THRESHOLD[0]) & (motions[:, 0] < NEAR_THRESHOLD[1])
     differences = Counter(
         f"{_described(pair.reference)} -> {_described(pair.candidate)}"
         for pair in pairs
@@ -141,14 +156,24 @@ def summarise(pairs: list[PairedTrial]) -> FidelityResult:
         positives=int(truth.sum()),
         candidate_positives=int(label.sum()),
         label_agreement=float((truth == label).mean()),
-        positive_f1=2 * found / positives if positives else 1.0,
+        positive_f1=_f1(truth, label),
         kind_agreement=float(np.mean([pair.reference.kind is pair.candidate.kind for pair in pairs])),
+        near_threshold=int(near.sum()),
+        near_threshold_other_labels=int((truth != label)[near].sum()),
+        clear_label_agreement=float((truth == label)[~near].mean()) if not near.all() else float("nan"),
+        clear_positive_f1=_f1(truth[~near], label[~near]),
         motion_error_median=float(np.median(errors)) if len(errors) else float("nan"),
         motion_error_p95=float(np.percentile(errors, 95)) if len(errors) else float("nan"),
         reference_ms=1e3 * float(np.mean([pair.reference_s for pair in pairs])),
         candidate_ms=1e3 * float(np.mean([pair.candidate_s for pair in pairs])),
         confusions=tuple(differences.most_common(8)),
     )
+
+
+def _f1(truth: NDArray[np.bool_], label: NDArray[np.bool_]) -> float:
+    """Of the successes; 1 where neither has any."""
+    positives = int(truth.sum() + label.sum())
+    return 2 * int((truth & label).sum()) / positives if positives else 1.0
 
 
 def _described(outcome: Outcome) -> str:

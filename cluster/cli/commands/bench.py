@@ -157,7 +157,7 @@ def run_benchmark(name: str, measure: Callable[[Any], dict[str, Any]], flags: An
 
 
 def _fidelity(command: FidelitySettings) -> dict[str, Any]:
-    from cluster.cli.benchmarks.fidelity import compare
+    from cluster.cli.benchmarks.fidelity import NEAR_THRESHOLD, compare
 
     with planned(command) as (plan, folder), Progress(f"trials, {command.task}", command.trials) as progress:
         result = compare(plan, folder, command.reference, command.candidate, command.trials, progress.advance)
@@ -165,6 +165,10 @@ def _fidelity(command: FidelitySettings) -> dict[str, Any]:
     print(f"  label agreement   {result.label_agreement:.1%}")
     print(f"  F1 of positives   {result.positive_f1:.3f}")
     print(f"  kind agreement    {result.kind_agreement:.1%}")
+    low, high = NEAR_THRESHOLD
+    print(f"  near threshold    {result.near_threshold} trials with m of {low} to {high}, ", end="")
+    print(f"{result.near_threshold_other_labels} with another label; without them: label agreement ", end="")
+    print(f"{result.clear_label_agreement:.1%}, F1 {result.clear_positive_f1:.3f}")
     print(f"  error of m        {result.motion_error_median:.2g} median, {result.motion_error_p95:.2g} at 95%")
     print(f"  CPU ms a trial    {result.reference_ms:.1f} {command.reference.name}, ", end="")
     print(f"{result.candidate_ms:.1f} {command.candidate.name}")

@@ -112,7 +112,7 @@ def run_collection(command: CollectCommand) -> None:
     from cluster.config.objects import objects_for
     from cluster.workers.session import worker_groups
     from cluster.workers.worker_group import make_worker
-    from collector.setting import make_setting, packages_used
+    from collector.setting import in_fidelity_of, make_setting, packages_used
     from collector.watchdog import Limits
     from shared.plan import Plan
     from shared.store import Store
@@ -131,7 +131,7 @@ def run_collection(command: CollectCommand) -> None:
     )
     setting = make_setting(
         task,
-        chosen.collection,
+        in_fidelity_of(where, chosen.collection),
         seed=chosen.seed,
         objects=_begun_with(where, tuple(entry.ref for entry in catalogue.usable)),
     )
