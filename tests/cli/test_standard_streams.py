@@ -42,6 +42,7 @@ SPEAKING = {
     "objects": ["objects", "check", "OBJECTS"],
     "bench": ["bench", "--help"],
     "view": ["view", "--help"],
+    "rehearse": ["rehearse", "--help"],
 }
 """Cheap command lines that say something and end with 0."""
 REFUSED = {
