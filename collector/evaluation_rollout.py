@@ -89,7 +89,7 @@ def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: Proposer
 def _exploit_by_share(
     recorder: Recorder, method: str, tried: list[Interaction], exploiter: Proposer, budgets: list[int], start: Float
 ) -> None:
-    """At each budget, execute what the method would do after its first tries, where they began."""
+    """At each budget, execute what the method would do after its first interactions, where they began."""
     for budget in budgets:
         if not recorder.sound:
             return

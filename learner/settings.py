@@ -99,8 +99,8 @@ class AapConfig(TrainingConfig):
     """The longest context; every shorter one, and none, is trained in the same pass."""
     augmentation: AugmentationConfig = AugmentationConfig()
     continued_first: float = Field(0.5, ge=0, le=1)
-    """How often the tries that continued one another come first in the context, where a rollout has some: what a policy
-    proposed, and random ones by `rollout.continued`."""
+    """How often the interactions that continued one another come first in the context, where a rollout has some: what a
+    policy proposed, and random ones by `rollout.continued`."""
     unknown_details: float = Field(0.25, ge=0, le=1)
     """How often the kinds of a rollout's outcomes, and how often its grasp widths, are left out in training, so that
     histories without them serve as well; only where `network.outcome_details` is set."""
@@ -125,20 +125,20 @@ class AipConfig(TrainingConfig):
     """Adaptive Interaction Proposal."""
 
     training: Literal["paper", "inherited"] = "inherited"
-    """"paper": a point encoder of its own, and L1, which finds the median gain of a try. "inherited": AAP's encoder as
-    it is, so that a step may see ten times the rollouts, squares, which find the mean gain, and, where an oracle taught
-    AAP, gains by what it expects instead of by single successes."""
+    """"paper": a point encoder of its own, and L1, which finds the median gain of an interaction. "inherited": AAP's
+    encoder as it is, so that a step may see ten times the rollouts, squares, which find the mean gain, and, where an
+    oracle taught AAP, gains by what it expects instead of by single successes."""
     steps: int = Field(200, ge=1)
     validate_every: int = Field(25, ge=1)
     patience: int = Field(8, ge=1)
     batch_rollouts: int = Field(24, ge=1)
     rows_per_rollout: int = Field(32, ge=2)
     context: int = Field(4, ge=1)
-    """Tries of an ordered subset; each gives one target."""
+    """Interactions of an ordered subset; each gives one target."""
     draws: int = Field(4, ge=1)
     """Ordered subsets a rollout and step, which share the encoded clouds."""
     continued_first: float = Field(0.5, ge=0, le=1)
-    """As for AAP: what a try tells depends on where those before it left the object."""
+    """As for AAP: what an interaction tells depends on where those before it left the object."""
     top: int = Field(5, ge=1)
     affordance: AffordanceConfig = AffordanceConfig(context=4)
 

@@ -49,7 +49,7 @@ class Curves:
         digest: of the store's content.
         rollouts: how many were judged on, of objects that no training had seen.
         left_out: rollouts of the store that were not, for their objects had been seen.
-        draws: how often tries and questions were drawn from each rollout.
+        draws: how often interactions and questions were drawn from each rollout.
         rows: of all trainings.
         gains: of the first run of each training that has an AIP, by its name.
     """
@@ -79,7 +79,7 @@ def as_json(curves: Curves) -> dict[str, Any]:
 
 
 def as_markdown(curves: Curves) -> str:
-    """Tables of all runs together, and what each next try tells."""
+    """Tables of all runs together, and what each next interaction tells."""
     pooled = [row for row in curves.rows if not row.run]
     base_rate = pooled[0].base_rate
     lines = [
@@ -127,7 +127,7 @@ def _gain_cells(gain: ProposalGain) -> list[str]:
 
 
 def _by_run(rows: Sequence[CurveRow]) -> list[str]:
-    """A line for each run, a column for each critic and number of tries."""
+    """A line for each run, a column for each critic and number of interactions."""
     asked = list(dict.fromkeys((row.critic, row.tries) for row in rows))
     runs = list(dict.fromkeys((row.name, row.run) for row in rows if row.run))
     found = {(row.name, row.run, row.critic, row.tries): row for row in rows}
@@ -142,7 +142,7 @@ def _by_run(rows: Sequence[CurveRow]) -> list[str]:
 
 
 def draw_curves(curves: Curves, path: Path) -> None:
-    """F-score and the share of the gap that is closed against the number of tries, with intervals over objects."""
+    """F-score and share of the gap that is closed by number of interactions, with intervals over objects."""
     figure = Figure(figsize=(10, 5), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)

@@ -28,7 +28,7 @@ class PublishedFigures:
     sample_success: tuple[float, ...]
 
     def at(self, budget: int, measure: str) -> float | None:
-        """The figure after a budget of tries; None where the paper has none."""
+        """The figure after a budget of interactions; None where the paper has none."""
         if measure not in STANDS_BESIDE:
             return None
         figures = self.f_score if STANDS_BESIDE[measure] == "f_score" else self.sample_success
@@ -128,7 +128,7 @@ def published_figure(task: str, method: str, budget: int, measure: str, *, novel
     Args:
         task: what was evaluated.
         method: any name.
-        budget: how many tries.
+        budget: how many interactions.
         measure: one of `STANDS_BESIDE`, or another, of which the paper has none.
         novel_categories: whether on categories that nothing was trained on.
     """

@@ -1,4 +1,4 @@
-"""Evaluation rollouts as one method lived them: its tries in order, and what it did in the end."""
+"""Evaluation rollouts as one method lived them: its interactions in order, and what it did in the end."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ TOLD: MethodName = "ours-final"
 MOST_TRIALS = 60
 """Looked at for pictures, at the most: each holds all clouds of its rollout, some megabytes."""
 CANDIDATES = 40
-"""Episodes among them that are asked for what their tries changed."""
+"""Episodes among them that are asked for what their interactions changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class EvaluationTrial:
 
     Attributes:
         rollout: where it comes from.
-        tries: rows of its tries.
+        tries: rows of its interactions.
         exploits: rows of what its adapted affordance chose, one a budget.
     """
 
@@ -36,7 +36,7 @@ class EvaluationTrial:
 
     @property
     def history(self) -> list[Interaction]:
-        """The tries as a proposer is told them."""
+        """The interactions as a proposer is told them."""
         return [Interaction(self.seen_by(row), row.action, row.outcome) for row in self.tries]
 
     def seen_by(self, row: InteractionRecord) -> Observation:
@@ -44,7 +44,7 @@ class EvaluationTrial:
         return self.rollout.observations[row.observation]
 
     def before(self, exploit: InteractionRecord) -> list[Interaction]:
-        """The tries that came before an exploit."""
+        """The interactions that came before an exploit."""
         return self.history[: exploit.budget]
 
 
@@ -68,12 +68,12 @@ def trials(evaluation: Store, method: MethodName) -> Iterator[EvaluationTrial]:
 
 
 def most_telling(found: list[EvaluationTrial], adapter: Adapter) -> EvaluationTrial | None:
-    """The episode whose affordance its tries changed the most; None where there is none."""
+    """The episode whose affordance its interactions changed the most; None where there is none."""
     return max(found[:CANDIDATES], key=lambda trial: _change(trial, adapter), default=None)
 
 
 def _change(trial: EvaluationTrial, adapter: Adapter) -> float:
-    """How much the tries changed the affordance of movable points; more where a try succeeded."""
+    """How much the interactions changed the affordance of movable points; more where an interaction succeeded."""
     history = trial.history
     observation = history[0].observation
     before, after = adapter.affordance(observation, []), adapter.affordance(observation, history)

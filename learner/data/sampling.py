@@ -40,7 +40,7 @@ class OrderedRows:
         return OrderedRows(self.rows[places], self.valid[places], self.clouds[clouds], which)
 
     def longest_context(self, limit: int) -> int:
-        """The longest context, of at most `limit` tries, that leaves a row to ask about."""
+        """The longest context, of at most `limit` interactions, that leaves a row to ask about."""
         return min(limit, self.rows.shape[1] - 1)
 
     def asked(self, context: int) -> Tensor:
@@ -67,8 +67,8 @@ def order_rows(
         rollouts: which ones, [B]; a rollout may occur more than once.
         size: n, the most rows of each.
         rng: draws the orders.
-        continued_first: how often the tries that continued one another come first, in the order in which they were
-            made, as at test time (AdaAfford, Training Strategy: AAP is fine-tuned with the proposed interactions).
+        continued_first: how often the interactions that continued one another come first, in the order in which they
+            were made, as at test time (AdaAfford, Training Strategy: AAP is fine-tuned with the proposed interactions).
     """
     orders, continued = [], dataset.rows.continued.numpy(force=True)
     for number in rollouts:

@@ -18,12 +18,12 @@ _PRIOR, _NO_TRIES, _ORACLE = Asked("where2act", 0), Asked("random", 0), Asked("o
 
 @dataclass(frozen=True, slots=True)
 class CurveRow:
-    """One critic after some tries; NaN where a figure is not defined.
+    """One critic after some interactions; NaN where a figure is not defined.
 
     Attributes:
         name: of the training.
         run: the place of its run among those of the name, from "1"; "" for all of them together.
-        critic: whose answers, and how its tries were chosen.
+        critic: whose answers, and how its interactions were chosen.
         tries: how many.
         f_score: at the threshold 0.5, with its 95% interval over objects.
         best_f_score: at the threshold best in hindsight.
@@ -31,10 +31,10 @@ class CurveRow:
         auc: area under the ROC curve.
         calibration_error: ECE.
         base_rate: share of successes among the questions.
-        questions: how many; a run's draws of tries and questions from one rollout all count.
+        questions: how many; a run's draws of interactions and questions from one rollout all count.
         objects: how many they are about.
         closed: share of the gap in cross entropy between Where2Act and the oracle, with its 95% interval over objects.
-        closed_from_none: the same of the gap between AAP without tries, a second prior, and the oracle.
+        closed_from_none: the same of the gap between AAP without interactions, a second prior, and the oracle.
     """
 
     name: str
@@ -62,14 +62,14 @@ def curve_rows(name: str, runs: Sequence[tuple[str, Answers]]) -> list[CurveRow]
 
     Args:
         name: of the training.
-        runs: each run's name and what its critics answered; all to the same critics and numbers of tries.
+        runs: each run's name and what its critics answered; all to the same critics and numbers of interactions.
     """
     pooled = rows_of(name, "", [answers for _, answers in runs])
     return pooled + [row for run, answers in runs for row in rows_of(name, run, [answers])]
 
 
 def rows_of(name: str, run: str, answers: Sequence[Answers]) -> list[CurveRow]:
-    """A row for each critic and number of tries."""
+    """A row for each critic and number of interactions."""
     labels = np.concatenate([found.labels for found in answers])
     _, groups = np.unique(np.concatenate([found.objects for found in answers]), return_inverse=True)
     scores = {

@@ -1,6 +1,6 @@
 """Critics of a policy, asked about rows of a data set instead of a camera's view (compare `shared.policies.critics`).
 
-What does not depend on the tries is computed once for all rows. Shapes: Q rows asked about, K tries.
+What does not depend on the interactions is computed once for all rows. Shapes: Q rows asked about, K interactions.
 """
 
 import torch
@@ -30,7 +30,7 @@ def row_critic(name: CriticName, policy: Policy, known: FrozenFeatures) -> RowCr
 
 
 class PriorScores:
-    """Where2Act, which knows nothing of tries."""
+    """Where2Act, which knows nothing of interactions."""
 
     def __init__(self, prior: FrozenPrior) -> None:
         self._prior = prior
@@ -58,7 +58,7 @@ class AdaptiveScores:
 
 
 class OracleScores:
-    """The oracle critic, which is told the hidden facts and needs no tries."""
+    """The oracle critic, which is told the hidden facts and needs no interactions."""
 
     def __init__(self, oracle: OracleCritic, known: FrozenFeatures) -> None:
         self._teacher = Teacher.of(oracle, known)

@@ -1,9 +1,13 @@
-"""The adaptation curve: what critics know of stored rollouts after 0, 1, 2, ... tries, between Where2Act and oracle.
+"""The adaptation curve: what critics know of stored rollouts after 0, 1, 2, ... interactions.
 
-Offline: half of a rollout's own rows are candidates for tries, the other half are the questions. The questions are the
-same for all critics and after every number of tries, so that two figures differ by critic and tries alone.
+Where2Act and the oracle are its bounds.
 
-Shapes: R rollouts times draws, n rows of each (padded), c candidates of each, K the most tries, Q questions in all.
+Offline: half of a rollout's own rows are candidates for interactions, the other half are the questions. The questions
+are the same for all critics and after every number of interactions, so that two figures differ by critic and
+interactions alone.
+
+Shapes: R rollouts times draws, n rows of each (padded), c candidates of each, K the most interactions, Q questions in
+all.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,13 +34,13 @@ from shared.networks.prior import Prior
 _CHUNK = 16
 
 CriticKind = Literal["where2act", "random", "aip", "information", "oracle"]
-"""Where2Act, which knows no tries; AAP after tries taken from the candidates at random, by AIP, or by what AAP expects
-to learn from them; the oracle, which is told the hidden facts."""
+"""Where2Act, which knows no interactions; AAP after interactions taken from the candidates at random, by AIP, or by
+what AAP expects to learn from them; the oracle, which is told the hidden facts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Whose answer it is, and after how many tries."""
+    """Whose answer it is, and after how many interactions."""
 
     critic: CriticKind
     tries: int
@@ -109,9 +113,9 @@ def answer(
         candidates: of rollouts whose objects nothing was trained on.
         frozen: the AAP.
         prior: Where2Act.
-        aip: to choose tries; None: random tries alone.
+        aip: to choose interactions; None: random interactions alone.
         oracle: a critic that is told the hidden facts.
-        tries: numbers of tries.
+        tries: numbers of interactions.
     """
     dataset, ordered, asked = known.dataset, candidates.ordered, candidates.questions
     index = ordered.rows[asked]
@@ -144,7 +148,7 @@ def tries_by_aip(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, a
         candidates: rows to choose from, [R, c].
         frozen: the AAP, whose z the choice depends on.
         aip: the chooser.
-        most: how many tries.
+        most: how many interactions.
     """
     rows, features = known.dataset.rows, known.rows(aip.encoder)[candidates]
     xyz, frames = rows.xyz[candidates], rows.frame[candidates]
@@ -174,14 +178,14 @@ def _scores(dataset: Dataset, index: Tensor, frozen: FrozenAap, latents: Tensor)
 
 @dataclass(frozen=True, slots=True)
 class ProposalGain:
-    """How much the loss on the questions drops by the next try, nats, on the mean over rollouts.
+    """How much the loss on the questions drops by the next interaction, nats, on the mean over rollouts.
 
     Attributes:
-        before: tries that were made at random before.
+        before: interactions that were made at random before.
         random: by a random candidate.
         aip: by the candidate with the highest AIP score.
         greedy: by the candidate that lowers it most, which only hindsight knows.
-        loss: on the questions before the try.
+        loss: on the questions before the interaction.
         correlation: of AIP scores with drops.
     """
 
@@ -197,9 +201,9 @@ class ProposalGain:
 def proposal_gains(
     known: FrozenFeatures, candidates: Candidates, frozen: FrozenAap, aip: Aip, most: int = 3
 ) -> list[ProposalGain]:
-    """Whether the AIP critic picks better tries than chance among the candidates that a rollout happens to have.
+    """Whether the AIP critic picks better interactions than chance among the candidates that a rollout happens to have.
 
-    For the first tries, of which there are `most`, as far as the candidates go.
+    For the first interactions, of which there are `most`, as far as the candidates go.
     """
     dataset, features = known.dataset, known.rows(aip.encoder)
     ordered, found = candidates.ordered, []

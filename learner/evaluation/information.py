@@ -1,10 +1,10 @@
-"""An information-seeking chooser of tries, as a reference for AIP: AAP alone says which try would settle the most.
+"""An information-seeking chooser of interactions, as a reference for AIP: AAP alone says which would settle the most.
 
 For each candidate AAP imagines both outcomes, reads them as if they had happened, and is asked how sure it would then
 be of all candidates. Nothing is trained for it; it costs two readings of every candidate and c^2 scores a step.
 Not in the paper (compare Lindley, 1956: the expected gain in Shannon information).
 
-Shapes: R rollouts, c candidates of each, k tries made.
+Shapes: R rollouts, c candidates of each, k interactions made.
 """
 
 import torch
@@ -26,7 +26,7 @@ def tries_by_information(known: FrozenFeatures, candidates: Tensor, frozen: Froz
         known: of the interactions.
         candidates: rows to choose from, [R, c].
         frozen: the AAP, by whose beliefs they are chosen.
-        most: how many tries.
+        most: how many interactions.
     """
     starts = range(0, len(candidates), _CHUNK)
     return torch.cat([_choose(known, candidates[start : start + _CHUNK], frozen, most) for start in starts])
@@ -45,7 +45,7 @@ def _choose(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, most: 
 
 
 def _imagined(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, success: bool) -> tuple[Tensor, Tensor]:
-    """Codes and weights of the candidates had they succeeded, or failed, each with the usual motion of such a try.
+    """Codes and weights of the candidates had they succeeded, or failed, each with the usual motion of such a one.
 
     What else an outcome tells (see `shared.networks.actions.outcome_details`) is unknown.
     """

@@ -1,8 +1,8 @@
-"""The table: what each method knows after each budget of tries, and whether acting on it succeeds.
+"""The table: what each method knows after each budget of interactions, and whether acting on it succeeds.
 
 An evaluation store holds, for each rollout, random QUERY rows that critics are asked about; for each method, CONTEXT
-rows, its tries in order; and for each method and budget, EXPLOIT rows, what the adapted affordance then chose where the
-tries had left the object, and EXPLOIT_AT_START rows, what it chose where they had begun.
+rows, its interactions in order; and for each method and budget, EXPLOIT rows, what the adapted affordance then chose
+where the interactions had left the object, and EXPLOIT_AT_START rows, what it chose where they had begun.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,9 +30,9 @@ from shared.types import Role
 
 PRIOR_METHOD = "where2act"
 NO_TRIES_METHOD = "aap-no-tries"
-"""AAP before any try: a second, often stronger, prior to compare with."""
+"""AAP before any interaction: a second, often stronger, prior to compare with."""
 ORACLE_METHOD = "oracle"
-"""A critic that is told the hidden facts: the bound of what tries can teach. It acts on nothing, so has no exploits."""
+"""A critic that is told the hidden facts: the bound of what interactions can teach. It never acts."""
 
 SHARES = ("f_score", "sample_success", "start_success", "mix_f_score", "shifted_f_score", "share_success")
 """Figures that follow from counts by object, so that they have intervals over objects and can be pooled."""
@@ -114,12 +114,12 @@ class ObjectCounts:
 
 @dataclass(frozen=True, slots=True)
 class EvaluationRow:
-    """One method after one budget of tries, on all rollouts together; NaN where there was nothing to measure.
+    """One method after one budget of interactions, on all rollouts together; NaN where there was nothing to measure.
 
     Attributes:
         task: what was evaluated.
-        method: whose tries.
-        budget: how many tries a rollout, at the most.
+        method: whose interactions.
+        budget: how many interactions a rollout, at the most.
         f_score: of the critic on the QUERY rows at the threshold 0.5.
         best_f_score: at the threshold best in hindsight.
         bce: binary cross entropy, nats.
@@ -129,7 +129,7 @@ class EvaluationRow:
         sample_success: share of the EXPLOIT rows that succeeded.
         start_success: share of the EXPLOIT_AT_START rows that succeeded.
         trials: how many EXPLOIT rows.
-        mean_tries: tries made a rollout, which stopping may leave below the budget.
+        mean_tries: interactions made a rollout, which stopping may leave below the budget.
         f_score_low: where its 95% interval over objects begins.
         f_score_high: where it ends.
         sample_success_low: where its 95% interval over objects begins.
@@ -189,7 +189,7 @@ def evaluate_store(
     Args:
         store: the evaluation store.
         version: which policy.
-        budgets: numbers of tries.
+        budgets: numbers of interactions.
         oracle: to judge beside it.
 
     Raises:
@@ -213,13 +213,13 @@ def evaluate(
 ) -> list[EvaluationRow]:
     """One row for each method and budget that there are rows of.
 
-    Where2Act, AAP with no tries and the oracle, where they are trained, have a row of their own at budget 0.
+    Where2Act, AAP with no interactions and the oracle, where they are trained, have a row of their own at budget 0.
 
     Args:
         dataset: the interactions.
         policies: that methods used, by version.
         version: the policy that is evaluated.
-        budgets: numbers of tries.
+        budgets: numbers of interactions.
         oracle: a critic that is told the hidden facts.
 
     Raises:
@@ -249,7 +249,7 @@ def _primitive(task: str) -> str | None:
 
 
 def _methods(dataset: Dataset) -> list[str]:
-    """Methods that made tries, in the order of the paper's table.
+    """Methods that made interactions, in the order of the paper's table.
 
     Raises:
         StoreError: a row is of a method that there is not.
@@ -357,7 +357,7 @@ class _Judge:
         )
 
     def _context(self, index: Tensor, method: str, budget: int) -> Tensor:
-        """A rollout's first `budget` tries of a method; the rows of a rollout are in order of step."""
+        """A rollout's first `budget` interactions of a method; the rows of a rollout are in order of step."""
         rows, numbers = self.dataset.rows, index.numpy()
         return index[(rows.role[numbers] == Role.CONTEXT.value) & (rows.method[numbers] == method)][:budget]
 

@@ -30,7 +30,7 @@ FROZEN_VALIDATION_ROLLOUTS = 192
 """Where no cloud needs to be encoded, more cost next to nothing, and what is best is better known."""
 _VALIDATION_SEED = 20
 CURVE = (0, 1, 2, 4, 8)
-"""Numbers of tries after which a validation says how well AAP does, as far as its context reaches."""
+"""Numbers of interactions after which a validation says how well AAP does, as far as its context reaches."""
 CURVE_FIGURES = ("bce", "f_score", "auc", "calibration_error")
 _CHUNK = 4
 """Rollouts validated at once."""
@@ -38,7 +38,7 @@ _CHUNK = 4
 
 @dataclass(frozen=True, slots=True)
 class SeenRows:
-    """Ordered rows as AAP sees them: tries and questions alike.
+    """Ordered rows as AAP sees them: interactions and questions alike.
 
     Attributes:
         features: of the points, [B, n, point_width].
@@ -84,8 +84,8 @@ class AapStage:
 
     Privileged training leaves the point encoder as it is, so that a step may see five times the rollouts: what is to be
     learnt is how rollouts differ, and with few of them a step AAP learnt their clouds by heart instead (27% of the gap
-    to the oracle closed with four tries; 44% with the encoder left alone, in a tenth of the time). From an oracle,
-    scores and z are drawn to the oracle's as well.
+    to the oracle closed with four interactions; 44% with the encoder left alone, in a tenth of the time). From an
+    oracle, scores and z are drawn to the oracle's as well.
     """
 
     name = "aap"
@@ -156,7 +156,7 @@ class AapStage:
         losses = {"critic": action_scoring_loss(prediction.logits, seen.success[:, None], asked)}
         if self._teacher is not None:
             surer = self._teacher.scores[ordered.rows][:, None]
-            # Tries are on one part, so that what is hidden, and its z, differ between states at the most.
+            # Interactions are on one part, so that what is hidden, and its z, differ between states at the most.
             told = self._teacher.latents[ordered.rows[:, 0]]
             losses["imitation"] = config.imitation * action_scoring_loss(prediction.logits, surer, asked)
             losses["distillation"] = config.distillation * distillation_loss(prediction.latents, told, asked.any(-1))
@@ -164,7 +164,7 @@ class AapStage:
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Figures on objects not trained on after each number of tries; "score" is over all prefixes."""
+        """Figures on objects not trained on after each number of interactions; "score" is over all prefixes."""
         rng = np.random.default_rng(_VALIDATION_SEED)
         count = VALIDATION_ROLLOUTS if self._features is None else FROZEN_VALIDATION_ROLLOUTS
         rollouts = spread(self.parts.validation, count)

@@ -51,7 +51,7 @@ class Questions:
         slot: [Q], which of the pool's points.
         point: p less the middle of what may be moved, [Q, 3].
         frames: proposals there, [Q, S, 6].
-        latents: z, [Q, latent_width]; of no tries where there is no AAP yet.
+        latents: z, [Q, latent_width]; of no interactions where there is no AAP yet.
     """
 
     cloud: Tensor
@@ -124,8 +124,8 @@ class AffordanceStage:
             pool: points and proposals.
             rng: draws the questions to learn from.
             frozen: whose z is asked about; None for Where2Act, which has none.
-            order: draws the tries; at random where it is not given.
-            shortest: the fewest tries whose z is asked about, where a rollout has as many.
+            order: draws the interactions; at random where it is not given.
+            shortest: the fewest interactions whose z is asked about, where a rollout has as many.
         """
         self.name = name
         self.module = critic.module.requires_grad_(True)
@@ -166,7 +166,7 @@ class AffordanceStage:
 
     @torch.no_grad()
     def _ask(self, rollouts: Sequence[int], count: int, rng: np.random.Generator) -> Answered:
-        """Draw questions about rollouts, each with a z of some of its tries, and have them answered."""
+        """Draw questions about rollouts, each with a z of some of its interactions, and have them answered."""
         ordered = self.order(rollouts, self.config.context + 1, rng)
         drawn = rng.integers(0, len(rollouts), count)
         which = torch.as_tensor(drawn)
@@ -184,7 +184,7 @@ class AffordanceStage:
         return Answered(tuple(torch.cat(each) for each in told), torch.cat([chunk.target for chunk in chunks]))
 
     def _latents(self, ordered: OrderedRows, which: Tensor, rng: np.random.Generator) -> Tensor:
-        """The z of the first tries of some of the rollouts, of which there may be none, [Q, latent_width]."""
+        """The z of the first interactions of some of the rollouts, of which there may be none, [Q, latent_width]."""
         if self.frozen is None:
             return torch.zeros(len(which), 0)
         context = ordered.longest_context(self.config.context)

@@ -31,10 +31,10 @@ class Gains:
     """Targets of the AIP critic, and what it is told.
 
     Attributes:
-        gains: drop of the AAP loss by each try, [B, K].
-        latents: z before each try, [B, K, latent_width].
-        scores: s^AAP_u|z of each try before it, [B, K].
-        mask: tries that have a target, [B, K].
+        gains: drop of the AAP loss by each interaction, [B, K].
+        latents: z before each interaction, [B, K, latent_width].
+        scores: s^AAP_u|z of each interaction before it, [B, K].
+        mask: interactions that have a target, [B, K].
     """
 
     gains: Tensor
@@ -47,8 +47,8 @@ class AipStage:
     """Trains all of `Aip` but D (AdaAfford, AIP Action Scoring Loss); AAP stays as it is.
 
     The drop of the AAP loss is measured on rows of the same rollout that are no context at all, the same for every
-    prefix, so that two losses differ by one try alone. Privileged: with a teacher, the loss is against what the oracle
-    expects instead of single successes, which are ten coins a rollout that would drown the drop.
+    prefix, so that two losses differ by one interaction alone. Privileged: with a teacher, the loss is against what the
+    oracle expects instead of single successes, which are ten coins a rollout that would drown the drop.
     """
 
     name = "aip"
@@ -141,7 +141,7 @@ class AipStage:
         return (mean_information_loss if self._inherits else information_loss)(predicted, gains, mask)
 
     def _predict(self, ordered: OrderedRows, found: Gains) -> Tensor:
-        """AIP scores of the tries of the context, [B, K]."""
+        """AIP scores of the interactions of the context, [B, K]."""
         rows, tries = self.dataset.rows, ordered.rows[:, : found.gains.shape[1]]
         if self._inherits:
             features = self.frozen.features[tries]

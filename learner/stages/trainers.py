@@ -177,7 +177,7 @@ class StageTrainer:
 
 
 class RowCritic(Protocol):
-    """What a method believes of rows after tries of the same rollout."""
+    """What a method believes of rows after interactions of the same rollout."""
 
     def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
         """Scores in [0, 1] of rows, [Q], after the rows `tries`, [K], of which there may be none; [Q]."""

@@ -1,4 +1,4 @@
-"""Baseline Where2Act-adaptation: which points are so similar that a try at one corrects what is said of the other?
+"""Baseline Where2Act-adaptation: which points are so similar that an interaction at one corrects the other's score?
 
 Shapes: B ordered sets of interactions, n rows of each, K the longest context.
 """
@@ -87,14 +87,14 @@ class AdaptationStage:
         context = ordered.longest_context(self.config.context)
         corrected = corrected_scores(self.network, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
         success = self.dataset.rows.success[ordered.rows]
-        # Without a try nothing is corrected, and nothing could be learnt.
+        # Without an interaction nothing is corrected, and nothing could be learnt.
         return correction_loss(corrected[..., 1:], success[..., None], ordered.asked(context)[:, 1:].transpose(1, 2))
 
 
 def corrected_scores(
     network: Where2ActAdaptation, dataset: Dataset, prior: FrozenPrior, asked: Tensor, tries: Tensor
 ) -> Tensor:
-    """Where2Act's scores of rows, corrected by every prefix of ordered tries; beyond [0, 1] where these add up.
+    """Where2Act's scores of rows, corrected by every prefix of ordered interactions; beyond [0, 1] where these add up.
 
     Args:
         network: the similarities.
@@ -104,7 +104,7 @@ def corrected_scores(
         tries: rows, [B, K].
 
     Returns:
-        [B, n, K + 1], from no tries to all of them.
+        [B, n, K + 1], from no interactions to all of them.
     """
     rows = dataset.rows
     distances = (rows.xyz[asked][:, :, None] - rows.xyz[tries][:, None]).norm(dim=-1)

@@ -1,4 +1,4 @@
-"""Baseline Where2Act-interaction: Where2Act learns to read four tries that are spread over the object.
+"""Baseline Where2Act-interaction: Where2Act learns to read four interactions that are spread over the object.
 
 Shapes: B rollouts, n rows of each.
 """
@@ -39,8 +39,8 @@ _CHUNK = 4
 class InteractionStage:
     """Trains all of `Where2ActInteraction` but D, on the loss of Where2Act's critic.
 
-    The tries are rows of the rollout, spread by furthest-point sampling over those at points that Where2Act takes for
-    actionable; all other rows are predicted.
+    The interactions are rows of the rollout, spread by furthest-point sampling over those at points that Where2Act
+    takes for actionable; all other rows are predicted.
     """
 
     name = NAME
@@ -65,7 +65,7 @@ class InteractionStage:
         """The branch and the critic; the encoder, which Where2Act has trained, more slowly."""
         network = self.network
         old = tuple(network.encoder.parameters())
-        # Four tries are always there, so that the z of none is never learnt.
+        # Four interactions are always there, so that the z of none is never learnt.
         left = {id(p) for p in (*old, *network.affordance_network().parameters(), network.empty_latent)}
         new = tuple(p for p in network.parameters() if id(p) not in left)
         return [ParameterGroup(new), ParameterGroup(old, self.config.inherited_rate)]
@@ -108,7 +108,7 @@ class InteractionStage:
     def _predict(
         self, ordered: OrderedRows, turns: Tensor | None = None, flips: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits of all rows after the tries, successes, and which rows are no tries, [B, n] each."""
+        """Logits of all rows after the interactions, successes, and which rows are no interactions, [B, n] each."""
         batch = Batch.of(self.dataset, ordered, turns, flips)
         context = ordered.longest_context(TRIES)
         features = batch.features(self.network.encoder)

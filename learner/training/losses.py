@@ -99,8 +99,8 @@ def information_loss(predicted: Tensor, gains: Tensor, mask: Tensor) -> Tensor:
 def mean_information_loss(predicted: Tensor, gains: Tensor, mask: Tensor | None = None) -> Tensor:
     """Squared error between AIP action scores and their targets, in units of `SCORE_SCALE`; not in the paper.
 
-    L1 is least at the median, and where successes are rare most tries tell nothing: the median gain of any try is
-    then about zero. What a proposal is worth is its mean gain, where squares are least.
+    L1 is least at the median, and where successes are rare most interactions tell nothing: the median gain of any of
+    them is then about zero. What a proposal is worth is its mean gain, where squares are least.
     """
     losses = ((predicted - gains.detach()) / SCORE_SCALE).square()
     return masked_mean(losses, torch.ones_like(losses, dtype=torch.bool) if mask is None else mask)

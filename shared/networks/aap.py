@@ -72,11 +72,11 @@ class Aap(nn.Module):
     def prefix_latents(self, codes: Tensor, weights: Tensor) -> Tensor:
         """The z of every prefix of ordered interactions, in one pass: sum z_i w_i / sum w_i.
 
-        Deviation, where `config.evidence` is set: a mean forgets how many tries agreed, so that a small perceptron
-        corrects it by the mean grown with the total weight.
+        Deviation, where `config.evidence` is set: a mean forgets how many interactions agreed, so that a small
+        perceptron corrects it by the mean grown with the total weight.
 
         Deviation: the paper leaves z of no interactions undefined; here it is a learned constant, so that "AAP with no
-        tries" is a prediction like the others.
+        interactions" is a prediction like the others.
 
         Args:
             codes: [..., K, latent_width].

@@ -50,7 +50,7 @@ class NetworkConfig(StrictModel):
     """Whether actions are multiplied with z and with outcomes, and AAP's D multiplies points with z (see
     `shared.networks.layers.Head`). As published: not."""
     evidence: bool = True
-    """Whether z is told how much was tried, beside the mean of what the tries say. As published: not."""
+    """Whether z is told how much was tried, beside the mean of what the interactions say. As published: not."""
 
     pinch_profile: bool = Field(False, exclude_if=lambda told: not told)
     """Whether an action enters with what lies between the fingers, from the depth image (see `shared.pinch`); stores

@@ -127,7 +127,7 @@ class Method:
 
     @property
     def draws_tries(self) -> bool:
-        """Whether its tries can be drawn from a share of the points; others are the same whatever the share."""
+        """Whether its interactions can be drawn from a share of the points; others are the same whatever the share."""
         return self.tries in PROPOSERS.names() and PROPOSERS.get(str(self.tries)).draw is not None
 
     def policy_version(self, evaluated: int) -> int:
