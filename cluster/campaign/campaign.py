@@ -26,7 +26,7 @@ from cluster.runs.run_folder import ObjectsUsed, RunFolder
 from cluster.runs.run_log import RunLog
 from cluster.runs.subprocesses import THREADS, Child
 from cluster.runs.warm_start import fit_to_start_from, seen_by, unknown, warm_start
-from cluster.workers.session import Crew, worker_groups
+from cluster.workers.session import CurrentWorkerGroup, worker_groups
 from collector.setting import make_setting, packages_used
 from learner.alternation import AlternationStep, Collect, Publish, alternation, perform
 from learner.settings import LearnerConfig
@@ -62,7 +62,7 @@ class Campaign:
         config: its settings.
     """
 
-    _crew: Crew
+    _worker_group: CurrentWorkerGroup
 
     def __init__(self, run: RunFolder, config: CampaignConfig) -> None:
         self._run = run
@@ -84,7 +84,7 @@ class Campaign:
             if changed and any(step.name not in run_log.finished for step in steps):
                 self._say(f"begun with other software: {changed}; new results may differ because of it")
             with worker_groups(config.workers, config.limits, config.ray_address) as make_worker_group:
-                self._crew = Crew(make_worker_group)
+                self._worker_group = CurrentWorkerGroup(make_worker_group)
                 run_log.run({step.name: partial(self._do, step) for step in steps}, self._say)
             from cluster.reporting.report import print_report
 
@@ -110,7 +110,7 @@ class Campaign:
         plan = Plan(setting=store.setting, proposer=step.proposer, policy_version=step.version)
         wanted = rollouts.of_round(step.version, len(store.setting.objects))
         with store.only_driver():
-            open_worker_group = partial(self._crew.for_store, store, folder)
+            open_worker_group = partial(self._worker_group.for_store, store, folder)
             collected = collect(store, plan, wanted, rollouts.per_shard, open_worker_group, folder)
         return figures_of(collected)
 
@@ -195,7 +195,7 @@ class Campaign:
             out=run.training("evaluate"),
             root=run.path,
         )
-        collected = evaluation.execute(self._crew, self._say)
+        collected = evaluation.execute(self._worker_group, self._say)
         return {**figures_of(collected), "policy": version}
 
     def _report(self) -> Mapping[str, Any]:

@@ -39,7 +39,7 @@ class Collected:
 
 
 @dataclass(frozen=True, slots=True)
-class Newest:
+class LatestPolicy:
     """Used instead of a plan: a proposer that always uses the newest published policy.
 
     Attributes:
@@ -59,7 +59,7 @@ class Newest:
 
 def collect(
     store: Store,
-    plan: Plan | Newest,
+    plan: Plan | LatestPolicy,
     rollouts: int,
     per_shard: int,
     open_worker_group: OpenWorkerGroup,
@@ -118,7 +118,7 @@ def collect(
     return Collected(progress.tally, progress.elapsed_s, worker_group.workers)
 
 
-def _plan_keys(store: Store, plan: Plan | Newest) -> list[str]:
+def _plan_keys(store: Store, plan: Plan | LatestPolicy) -> list[str]:
     """The key of the plan, or the keys of all plans of the proposer."""
     if isinstance(plan, Plan):
         return [plan.key]
@@ -173,7 +173,7 @@ class _Snapshot:
         )
 
 
-def _require_interactions(store: Store, plan: Plan | Newest) -> None:
+def _require_interactions(store: Store, plan: Plan | LatestPolicy) -> None:
     """Check that the plan has an interaction in the store; manifests are read up to the first that has one."""
     keys = _plan_keys(store, plan)
     if any(store.manifest(job).interactions for key in keys for job in store.jobs(key)):
@@ -188,7 +188,7 @@ def _require_interactions(store: Store, plan: Plan | Newest) -> None:
     )
 
 
-def _report_quarantined(store: Store, plan: Plan | Newest, objects: Path) -> None:
+def _report_quarantined(store: Store, plan: Plan | LatestPolicy, objects: Path) -> None:
     """Log which rollouts are quarantined, why, and the command that executes each alone."""
     shards = (shard for key in _plan_keys(store, plan) for shard in store.manifests(key))
     given_up = quarantined_in(shards, store.where, objects)

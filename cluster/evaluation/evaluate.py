@@ -13,7 +13,7 @@ from typing import Any
 
 from cluster.collection.driver import Collected, collect
 from cluster.runs.subprocesses import Child
-from cluster.workers.session import Crew
+from cluster.workers.session import CurrentWorkerGroup
 from shared.errors import UsageError
 from shared.plan import EvaluationConfig, Plan
 from shared.policies.methods import METHODS, versions_of
@@ -57,11 +57,11 @@ class Evaluation:
         assert config is not None, "an evaluation store says what is evaluated"
         return config
 
-    def execute(self, crew: Crew, say: Callable[[str], None]) -> Collected:
+    def execute(self, worker_group: CurrentWorkerGroup, say: Callable[[str], None]) -> Collected:
         """Do what is left of the trials, and write the table.
 
         Args:
-            crew: executes the trials; dismissed before the table, which wants its cores.
+            worker_group: executes the trials; dismissed before the table, which wants its cores.
             say: is told what the process that judges prints.
 
         Raises:
@@ -73,9 +73,9 @@ class Evaluation:
             raise UsageError(f"{self.store.where}: holds trials of another policy ({others[0]}); name another folder")
         self._publish()
         with self.store.only_driver():
-            open_worker_group = partial(crew.for_store, self.store, self.objects)
+            open_worker_group = partial(worker_group.for_store, self.store, self.objects)
             collected = collect(self.store, plan, self.rollouts, self.per_shard, open_worker_group, self.objects)
-            crew.dismiss()
+            worker_group.dismiss()
             told = {"store": self.store.where, "version": self.version, "out": str(self.out), "aap": str(self.oracle)}
             with closing(Child(say, self.root)) as child:
                 child.run("cluster.evaluation.policy_evaluation:write_judgement", told, self.out)

@@ -18,7 +18,7 @@ from cluster.evaluation.evaluate import Evaluation
 from cluster.evaluation.tables import MARKDOWN_FILE, RESULTS_FILE
 from cluster.runs.run_folder import RunFolder, find
 from cluster.runs.warm_start import folder_of, seen_by, unknown
-from cluster.workers.session import Crew, worker_groups
+from cluster.workers.session import CurrentWorkerGroup, worker_groups
 from collector.setting import in_fidelity_of, make_setting
 from collector.watchdog import Limits
 from shared.config import CollectionConfig
@@ -198,7 +198,9 @@ def _execute(evaluation: Evaluation, settings: EvaluateSettings) -> None:
     console = Console(file=sys.stderr, highlight=False)
     limits = Limits(settings.rollout_limit_s, settings.memory_limit_mb)
     with worker_groups(settings.workers, limits, settings.ray_address) as make_worker_group:
-        evaluation.execute(Crew(make_worker_group), lambda line: console.print(line, markup=False, soft_wrap=True))
+        evaluation.execute(
+            CurrentWorkerGroup(make_worker_group), lambda line: console.print(line, markup=False, soft_wrap=True)
+        )
 
 
 def _version(run: RunFolder, policies: Store, wanted: int | None) -> int:

@@ -19,7 +19,7 @@ from ray.exceptions import RayError, RayTaskError
 
 from cluster.workers.job_queue import JobQueue, PlannedJob
 from cluster.workers.metrics import Cause, WorkerMetrics
-from cluster.workers.retries import Backlog, Failure, RetryPolicy, of_environment
+from cluster.workers.retries import Failure, RetryPolicy, RetryQueue, of_environment
 from cluster.workers.slots import Slot, Slots, Task
 from cluster.workers.worker_group import WAIT_S
 from collector.actor import WorkerActor
@@ -146,7 +146,7 @@ class RayWorkerGroup:
     def run(self, queue: JobQueue, on_result: Callable[[JobResult], None]) -> None:
         """See `WorkerGroup.run`."""
         retries = RetryPolicy(self.workers)
-        backlog = Backlog(queue, retries)
+        backlog = RetryQueue(queue, retries)
         try:
             while not backlog.ended or self._in_flight:
                 self._hand_out(backlog, retries)
@@ -177,7 +177,7 @@ class RayWorkerGroup:
             except Empty:
                 return
 
-    def _hand_out(self, backlog: Backlog, retries: RetryPolicy) -> None:
+    def _hand_out(self, backlog: RetryQueue, retries: RetryPolicy) -> None:
         """Submit jobs to the actors that are up, and start an actor for each job that has to wait.
 
         An actor may start late or never (its machine may be gone), so no job waits for a particular actor.
@@ -217,7 +217,7 @@ class RayWorkerGroup:
         answer.add_done_callback(lambda _: self._answered.put(slot))
 
     def _take_in(
-        self, slot: Slot, backlog: Backlog, retries: RetryPolicy, on_result: Callable[[JobResult], None]
+        self, slot: Slot, backlog: RetryQueue, retries: RetryPolicy, on_result: Callable[[JobResult], None]
     ) -> None:
         """Report the result of the slot's oldest task, or handle its failure."""
         task = slot.tasks[0]
@@ -249,7 +249,7 @@ class RayWorkerGroup:
         if task.planned is not None:
             on_result(message)
 
-    def _replace_hung(self, backlog: Backlog, retries: RetryPolicy) -> None:
+    def _replace_hung(self, backlog: RetryQueue, retries: RetryPolicy) -> None:
         """Replace hung actors that their own watchdog did not end.
 
         A rollout exceeds its limit when the driver has seen the same heartbeat for that long by the driver's clock,
@@ -272,7 +272,7 @@ class RayWorkerGroup:
             elif busy_s > START_LIMIT_S:
                 self._call_again(slot, retries)
 
-    def _look(self, slot: Slot, backlog: Backlog, retries: RetryPolicy) -> None:
+    def _look(self, slot: Slot, backlog: RetryQueue, retries: RetryPolicy) -> None:
         """Replace a slot's actor if it hangs."""
         heartbeat, since = slot.look(self._crash_log)
         limit = START_LIMIT_S if heartbeat is None else self._limits.rollout_s + GRACE_S
@@ -307,7 +307,7 @@ class RayWorkerGroup:
             slot.retiring = True
 
     def _fail(
-        self, slot: Slot, backlog: Backlog, retries: RetryPolicy, failure: Failure, *, in_rollout: bool = True
+        self, slot: Slot, backlog: RetryQueue, retries: RetryPolicy, failure: Failure, *, in_rollout: bool = True
     ) -> None:
         """Replace the slot's actor, put its jobs back in front, and count the failure for the rollout that was running.
 

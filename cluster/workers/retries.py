@@ -7,7 +7,7 @@ quarantined after many of them, and random kills of workers do not change the da
 
 Quarantine is for rollouts, and not for an environment in which none can succeed (a missing library, a full disk, a
 limit that is too low). So a rollout is quarantined only after another rollout has succeeded. Until then its job is held
-back (`Backlog`). If several rollouts fail in the same way before that, the collection ends and stores none of them.
+back (`RetryQueue`). If several rollouts fail in the same way before that, the collection ends and stores none of them.
 """
 
 import logging
@@ -194,7 +194,7 @@ def of_environment(error: BaseException) -> bool:
     return isinstance(error, OSError | ImportError)
 
 
-class Backlog:
+class RetryQueue:
     """Jobs to hand out: first failed ones, then new ones, and last those with a rollout to quarantine.
 
     Args:

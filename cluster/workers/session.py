@@ -63,7 +63,7 @@ WorkerGroupMaker = Callable[[WorkerFactory, CrashLog], WorkerGroup]
 logger = logging.getLogger(__name__)
 
 
-class Crew:
+class CurrentWorkerGroup:
     """The live worker group: one at a time, since each worker holds a CPU; kept as long as the store stays the same."""
 
     def __init__(self, make_worker_group: WorkerGroupMaker) -> None:

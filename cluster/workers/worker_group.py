@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Protocol
 
 from cluster.workers.job_queue import JobQueue, PlannedJob
-from cluster.workers.retries import Backlog, Failure, RetryPolicy
+from cluster.workers.retries import Failure, RetryPolicy, RetryQueue
 from collector.job_result import JobResult, JobWorker, WorkerFactory
 from shared.errors import AdaAffordError
 
@@ -88,7 +88,7 @@ class SerialWorkerGroup:
     def run(self, queue: JobQueue, on_result: Callable[[JobResult], None]) -> None:
         """See `WorkerGroup.run`."""
         retries = RetryPolicy()
-        backlog = Backlog(queue, retries)
+        backlog = RetryQueue(queue, retries)
         while not backlog.ended:
             planned = backlog.take(idle=True)
             if planned is None:

@@ -12,7 +12,7 @@ from cluster.campaign.campaign import steps_of
 from cluster.collection.driver import collect
 from cluster.collection.tally import CollectionProgress
 from cluster.config.campaign_config import CampaignConfig
-from cluster.workers.session import Crew
+from cluster.workers.session import CurrentWorkerGroup
 from cluster.workers.worker_group import SerialWorkerGroup, WorkerGroup
 from collector.job_result import JobResult, WorkerFactory
 from collector.watchdog import UnderWay
@@ -144,9 +144,9 @@ def test_the_same_live_worker_group_serves_all_rounds_of_a_store(tmp_path: Path)
         made.append(FakeWorkerGroup())
         return made[-1]
 
-    crew = Crew(make)
-    assert crew.for_store(one, OBJECTS) is crew.for_store(one, OBJECTS)
-    crew.for_store(other, OBJECTS)
+    worker_group = CurrentWorkerGroup(make)
+    assert worker_group.for_store(one, OBJECTS) is worker_group.for_store(one, OBJECTS)
+    worker_group.for_store(other, OBJECTS)
     assert [worker_group.closed for worker_group in made] == [True, False]
 
 

@@ -20,7 +20,7 @@ from cluster.evaluation.policy_evaluation import evaluate_policy
 from cluster.evaluation.run_evaluation import evaluate_run, evaluate_without_run
 from cluster.evaluation.tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
 from cluster.workers.retries import JobError
-from cluster.workers.session import Crew
+from cluster.workers.session import CurrentWorkerGroup
 from collector.objects.procedural.writing import generate
 from collector.worker import Worker
 from learner.evaluation.bootstrap import ratio_interval
@@ -148,7 +148,7 @@ def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) 
     evaluation.add_plan(Plan(setting=evaluation.setting, proposer=PROPOSER, policy_version=7))
     wanted = Evaluation(evaluation, store.read_policy, 1, 2, 1, finished / "objects", *[tmp_path] * 3)
     with pytest.raises(UsageError, match="trials of another policy"):
-        wanted.execute(Crew(lambda *_: pytest.fail("a worker group was asked for")), print)
+        wanted.execute(CurrentWorkerGroup(lambda *_: pytest.fail("a worker group was asked for")), print)
 
 
 def row_of(method: str, budget: int, f_score: float) -> EvaluationRow:

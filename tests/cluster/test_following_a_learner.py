@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cluster.cli.commands.collect import CollectCommand
 from cluster.cli.main import run
-from cluster.collection.driver import Newest, collect
+from cluster.collection.driver import LatestPolicy, collect
 from cluster.collection.status_writer import read_status
 from cluster.workers.job_queue import RolloutQueue
 from cluster.workers.policy_source import LOOK_S, PolicySource
@@ -64,7 +64,9 @@ class LearningWorker:
         return JobResult(job.shard_id, len(records), 0, 0, {}, {"total": 0.5})
 
 
-def fill(store: Store, rollouts: int, plan: Newest, publishes: Mapping[int, int], breaks_at: int | None = None) -> None:
+def fill(
+    store: Store, rollouts: int, plan: LatestPolicy, publishes: Mapping[int, int], breaks_at: int | None = None
+) -> None:
     worker = LearningWorker(store, publishes, breaks_at)
     collect(store, plan, rollouts, PER_SHARD, lambda: SerialWorkerGroup(lambda: worker), OBJECTS)
 
@@ -86,7 +88,7 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("at_once")
 def test_new_versions_are_taken_up_without_a_stop(store: Store) -> None:
     publish(store, 1)
-    fill(store, 10, Newest(), {2: 2, 3: 3})
+    fill(store, 10, LatestPolicy(), {2: 2, 3: 3})
     assert held(store) == {1: [0, 1, 2, 3], 2: [4, 5], 3: [6, 7, 8, 9]}
     assert verify(store) == []
     rows = store.interactions(["rollout", "policy_version"]).to_pydict()
@@ -99,12 +101,12 @@ def test_new_versions_are_taken_up_without_a_stop(store: Store) -> None:
 def test_a_stopped_one_goes_on_with_the_newest_and_does_nothing_twice(store: Store) -> None:
     publish(store, 1)
     with pytest.raises(WorkerError):
-        fill(store, 8, Newest(), {}, breaks_at=2)
+        fill(store, 8, LatestPolicy(), {}, breaks_at=2)
     publish(store, 2)
-    fill(store, 8, Newest(), {})
+    fill(store, 8, LatestPolicy(), {})
     assert held(store) == {1: [0, 1, 2, 3], 2: [4, 5, 6, 7]}
     digest = store.digest()
-    fill(store, 8, Newest(), {})
+    fill(store, 8, LatestPolicy(), {})
     assert store.digest() == digest
 
 
@@ -113,7 +115,7 @@ def test_rounds_wait_for_the_next_version(store: Store) -> None:
     publish(store, 1)
     learner = threading.Timer(1.0, publish, (store, 2))
     learner.start()
-    fill(store, 7, Newest(per_version=5), {})
+    fill(store, 7, LatestPolicy(per_version=5), {})
     learner.join()
     assert held(store) == {1: [0, 1, 2, 3, 4], 2: [5, 6]}
 
@@ -123,10 +125,10 @@ def test_rounds_are_the_same_whenever_they_are_stopped(store: Store, tmp_path: P
     whole = Store.create(tmp_path / "whole", SETTING)
     for each in (store, whole):
         publish(each, 1)
-    fill(whole, 6, Newest(per_version=3), {2: 2})
+    fill(whole, 6, LatestPolicy(per_version=3), {2: 2})
     with pytest.raises(WorkerError):
-        fill(store, 6, Newest(per_version=3), {}, breaks_at=1)
-    fill(store, 6, Newest(per_version=3), {1: 2})
+        fill(store, 6, LatestPolicy(per_version=3), {}, breaks_at=1)
+    fill(store, 6, LatestPolicy(per_version=3), {1: 2})
     assert store.digest() == whole.digest()
 
 
@@ -138,7 +140,7 @@ def test_the_first_policy_is_waited_for(store: Store, capsys: pytest.CaptureFixt
 
     learner = threading.Thread(target=publish_when_waited_for, daemon=True)
     learner.start()
-    fill(store, 2, Newest(), {})
+    fill(store, 2, LatestPolicy(), {})
     learner.join()
     assert held(store) == {1: [0, 1]}
     assert "waiting" in capsys.readouterr().err
@@ -190,14 +192,14 @@ def test_a_new_policy_takes_effect_within_the_bound_and_versions_never_go_back(s
 def test_the_driver_writes_down_how_it_stands(store: Store) -> None:
     publish(store, 1)
     with pytest.raises(WorkerError):
-        fill(store, 8, Newest(), {}, breaks_at=2)
+        fill(store, 8, LatestPolicy(), {}, breaks_at=2)
     status = read_status(store.backend)
     assert status is not None
     assert (status.state, status.title, status.policy) == ("stopped", "aip-latest", 1)
     assert (status.done, status.total, status.left) == (4, 8, 4)
     assert status.restarts == 3
     assert not status.is_alive(status.written)
-    fill(store, 8, Newest(), {})
+    fill(store, 8, LatestPolicy(), {})
     status = read_status(store.backend)
     assert status is not None and (status.state, status.done, status.rollouts) == ("done", 8, 4)
     assert verify(store) == []

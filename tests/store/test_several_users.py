@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from cluster.cli.main import run
-from cluster.collection.driver import Newest, collect
+from cluster.collection.driver import LatestPolicy, collect
 from cluster.collection.status_writer import DriverStatus
 from learner.rounds import publish
 from learner.settings import PUBLISHED_FILE
@@ -142,7 +142,7 @@ def test_a_lost_plan_makes_no_rollout_twice(tmp_path: Path) -> None:
     store = make(str(tmp_path / "store"), 2, AIP)
     store.publish_policy(2, {"policy.json": b"{}"})
     (store.path / "plans/aip-v1.json").unlink()
-    collected = collect(store, Newest("aip"), 2, 1, pytest.fail, tmp_path)
+    collected = collect(store, LatestPolicy("aip"), 2, 1, pytest.fail, tmp_path)
     assert collected.workers == 0, "both rollouts are there, so no worker group is opened"
 
 

@@ -108,7 +108,7 @@ def _begun_with(where: str, found: "tuple[ObjectRef, ...]") -> "tuple[ObjectRef,
 
 def run_collection(command: CollectCommand) -> None:
     """Collect what is left of a command that was checked."""
-    from cluster.collection.driver import Newest, collect
+    from cluster.collection.driver import LatestPolicy, collect
     from cluster.config.objects import objects_for
     from cluster.workers.session import worker_groups
     from cluster.workers.worker_group import make_worker
@@ -140,9 +140,9 @@ def run_collection(command: CollectCommand) -> None:
         print(
             f"{store.where}: begun with other software: {changed}; new rows may differ because of it", file=sys.stderr
         )
-    plan: Plan | Newest
+    plan: Plan | LatestPolicy
     if command.policy == "latest":
-        plan = Newest(command.proposer, chosen.per_version)
+        plan = LatestPolicy(command.proposer, chosen.per_version)
     else:
         plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
     limits = Limits(chosen.rollout_limit_s, chosen.memory_limit_mb)
