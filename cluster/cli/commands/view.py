@@ -1,5 +1,6 @@
 """`adaafford view`: a store, a run or a scan in the browser."""
 
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -52,15 +53,16 @@ class ViewCommand:
 
 def main(args: list[str]) -> int:
     """Show something until Ctrl-C."""
-    command = parse_flags(ViewCommand, args, "view")
-    try:
-        with viewing(command) as server:
-            port = server.get_port()
-            print(f"http://127.0.0.1:{port} shows it, on this machine only; Ctrl-C ends the viewer")
-            print(f"from another machine: ssh -L {port}:127.0.0.1:{port} HOST, then the same address", flush=True)
-            threading.Event().wait()
-    except KeyboardInterrupt:
-        print("the viewer has ended")
+    command, ended = parse_flags(ViewCommand, args, "view"), threading.Event()
+    with viewing(command) as server:
+        port = server.get_port()
+        # An exception in the middle of printing would have the line printed twice.
+        signal.signal(signal.SIGINT, lambda *_: ended.set())
+        print(f"http://127.0.0.1:{port} shows it, on this machine only; Ctrl-C ends the viewer")
+        print(f"from another machine: ssh -L {port}:127.0.0.1:{port} HOST, then the same address", flush=True)
+        ended.wait()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    print("the viewer has ended")
     return 0
 
 
