@@ -247,7 +247,7 @@ def browsed(page: Path, profile: Path) -> subprocess.CompletedProcess[str]:
     """What a browser makes of a page: the document as it stands in the end, and what it says on its console."""
     assert BROWSER is not None
     flags = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    flags += ["--window-size=1300,6000", "--virtual-time-budget=200000", "--enable-logging=stderr"]
+    flags += ["--window-size=1300,6000", "--virtual-time-budget=2000000", "--enable-logging=stderr"]
     command = [BROWSER, *flags, f"--user-data-dir={profile}", "--dump-dom", page.as_uri()]
     return subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
 
@@ -282,7 +282,7 @@ def test_in_a_browser_tabs_change_the_figure_and_its_clouds_turn_together(tmp_pa
 VISITOR = """
 const wait = (ms) => new Promise((done) => setTimeout(done, ms));
 const drawn = () => [...document.querySelectorAll(".plot")].map((node) => !!node.dataset.drawn && !!node._fullLayout);
-const until = async (met) => { for (let k = 0; k < 900 && !met(); k++) await wait(100); };
+const until = async (met) => { for (let k = 0; k < 9000 && !met(); k++) await wait(100); };
 (async () => {
   await until(() => drawn()[0]);
   const before = drawn();
