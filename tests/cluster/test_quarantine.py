@@ -315,14 +315,14 @@ def test_crashes_hangs_and_kills_cost_themselves_alone_on_ray(tmp_path: Path) ->
     mishaps = {1: "crash", 6: "hang", 7: "raise", 10: "kill"}
     disturbed, undisturbed = new_store(tmp_path / "disturbed"), new_store(tmp_path / "undisturbed")
     plan = Plan(setting=disturbed.setting)
-    with worker_groups(2, Limits(rollout_s=2.0)) as make:
+    with worker_groups(2, Limits(rollout_s=6.0)) as make:
         worker_group = make(partial(MisbehavingWorker, disturbed.path, mishaps), disturbed.crash_log)
         collect(disturbed, plan, ROLLOUTS, PER_SHARD, lambda: worker_group, OBJECTS)
     fill(undisturbed, {})
     assert_only_these_are_missing(disturbed, undisturbed, set(mishaps))
     reasons = {each.rollout: each.reason for shard in disturbed.committed() for each in shard.quarantined}
     assert reasons[1].startswith("Segmentation fault, in string_at ")
-    assert reasons[6].startswith("took more than 0:00:02, in execute (misbehaving_worker.py:")
+    assert reasons[6].startswith("took more than 0:00:06, in execute (misbehaving_worker.py:")
     assert reasons[7] == "RuntimeError: the engine exploded (3 times)"
     assert reasons[10].startswith("its process was lost without a traceback")
 
