@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -13,8 +13,6 @@ from shared.io.text import plain
 from shared.types import OutcomeKind
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from adaafford.sessions import Session
 
 MAX_LINE_BYTES = 1 << 16
@@ -114,23 +112,34 @@ def lines_of(stream: BinaryIO) -> Iterator[bytes]:
         yield line
 
 
+def answer_lines(advice: str, answer: Callable[[bytes], str]) -> None:
+    """Answer each line of the standard input by a line; one that cannot be answered, by its reason.
+
+    Args:
+        advice: end of the message about a line that is too long: what to write instead.
+        answer: makes the line of the answer; what it raises of our own errors is the reason.
+    """
+    for line in lines_of(sys.stdin.buffer):
+        try:
+            if len(line) >= MAX_LINE_BYTES:
+                raise UsageError(f"a line of more than {MAX_LINE_BYTES} bytes; {advice}")
+            print(answer(line), flush=True)
+        except AdaAffordError as error:
+            print(json.dumps({"error": str(error)}), flush=True)
+
+
 def _say(line: str) -> None:
     print(f"adaafford: {plain(line)}", file=sys.stderr, flush=True)
 
 
 def _follow(session: "Session", folder: Path) -> None:
-    """Answer each line of the standard input by a line; one that cannot be answered, by its reason."""
+    """Go on with the session, line by line."""
     from adaafford.sessions import Request
 
-    for line in lines_of(sys.stdin.buffer):
-        try:
-            if len(line) >= MAX_LINE_BYTES:
-                raise UsageError(f"a line of more than {MAX_LINE_BYTES} bytes; " + 'write {"cloud": "scan.ply"}')
-            request = Request.read(line)
-            if request.health:
-                answer: BaseModel = session.health
-            else:
-                answer = session.step(folder / request.cloud, request.outcome, request.interaction)
-            print(answer.model_dump_json(), flush=True)
-        except AdaAffordError as error:
-            print(json.dumps({"error": str(error)}), flush=True)
+    def answer(line: bytes) -> str:
+        request = Request.read(line)
+        if request.health:
+            return session.health.model_dump_json()
+        return session.step(folder / request.cloud, request.outcome, request.interaction).model_dump_json()
+
+    answer_lines('write {"cloud": "scan.ply"}', answer)

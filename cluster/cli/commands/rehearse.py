@@ -1,7 +1,5 @@
 """`adaafford rehearse`: a simulated robot behind the protocol of `adaafford adapt --follow`."""
 
-import json
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -11,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from cluster.config.flags import parse_flags
-from shared.errors import AdaAffordError, UsageError
+from shared.errors import UsageError
 from shared.extras import require
 from shared.io.files import make_folder
 
@@ -125,16 +123,11 @@ def _follow(robot: "SimulatedRobot") -> int:
     """Execute the answers on standard input; print what a session reads."""
     from adaafford.histories import parse_json
     from adaafford.sessions import Step
-    from cluster.cli.commands.adapt import MAX_LINE_BYTES, lines_of
+    from cluster.cli.commands.adapt import answer_lines
 
+    advice = "write an answer of adapt --follow"
     print(_line(robot.request), flush=True)
-    for line in lines_of(sys.stdin.buffer):
-        try:
-            if len(line) >= MAX_LINE_BYTES:
-                raise UsageError(f"a line of more than {MAX_LINE_BYTES} bytes; write an answer of adapt --follow")
-            print(_line(robot.execute(parse_json(Step, line, "", "write an answer of adapt --follow"))), flush=True)
-        except AdaAffordError as error:
-            print(json.dumps({"error": str(error)}), flush=True)
+    answer_lines(advice, lambda line: _line(robot.execute(parse_json(Step, line, "", advice))))
     return 0
 
 
