@@ -9,6 +9,7 @@ Files are hostile until checked: bounded in size, finite, never pickled.
 Shapes: M points of a scan, N points that are kept of it.
 """
 
+import io
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -308,6 +309,28 @@ def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = PO
     )
 
 
+def npz_of(scan: Scan) -> bytes:
+    """A scan as NPZ. Points that were not measured are 0 0 0, so that all others keep their rows."""
+    rows = np.arange(len(scan.points)) if scan.rows is None else scan.rows
+    total = len(scan.points) + scan.missing
+
+    def in_rows(values: NDArray[np.generic]) -> NDArray[np.generic]:
+        every = np.zeros((total, *values.shape[1:]), values.dtype)
+        every[rows] = values
+        return every
+
+    arrays = {"points": in_rows(_narrow(scan.points))}
+    if scan.normals is not None:
+        arrays["normals"] = in_rows(_narrow(scan.normals))
+    if scan.movable is not None:
+        arrays["movable"] = in_rows(scan.movable)
+    if scan.camera is not None:
+        arrays["camera"] = np.array(scan.camera)
+    held = io.BytesIO()
+    np.savez_compressed(held, allow_pickle=False, **arrays)
+    return held.getvalue()
+
+
 @dataclass(frozen=True, slots=True)
 class ScannedSurface:
     """A scan before it was thinned; implements `shared.types.DenseGeometry`.
@@ -408,3 +431,9 @@ def _facing(normals: Float, points: Float, camera: Float) -> Float:
     towards = (normals * (camera - points)).sum(axis=1, keepdims=True)
     facing: Float = np.where(towards < 0, -normals, normals)
     return facing
+
+
+def _narrow(values: Float) -> NDArray[np.generic]:
+    """The same numbers in single precision where that loses nothing."""
+    short = values.astype(np.float32)
+    return short if (short == values).all() else values

@@ -6,17 +6,16 @@ file beside the scans, which is written after each interaction, so a rehearsal c
 An answer that comes a second time is not executed again.
 """
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from adaafford.histories import TriedOutcome, parse_json
-from adaafford.scans import ScanFrame, action_at
+from adaafford.scans import Scan, ScanFrame, action_at, npz_of
 from adaafford.sessions import Request, Session, Step
 from collector.sim.depth_noise import noisy
 from collector.sim.environment import camera_for
@@ -180,12 +179,13 @@ class SimulatedRobot:
         image = noisy(
             camera.capture(self._environment.state()), self._config.image_size, place, self._state.setting.noise, rng
         )
-        arrays: dict[str, Any] = {"points": (image.points + BASE).astype(np.float32), "camera": place + BASE}
-        if self._state.setting.marked:
-            arrays["movable"] = np.isin(image.bodies, self._parts)
-        packed = io.BytesIO()
-        np.savez_compressed(packed, **arrays)
-        write_atomically(self._scan_path(number), packed.getvalue())
+        x, y, z = (place + BASE).tolist()
+        scan = Scan(
+            (image.points + BASE).astype(np.float32).astype(np.float64),
+            movable=np.isin(image.bodies, self._parts) if self._state.setting.marked else None,
+            camera=(x, y, z),
+        )
+        write_atomically(self._scan_path(number), npz_of(scan))
 
     def _write_state(self) -> None:
         write_atomically(self.folder / STATE, self._state.model_dump_json(indent=2).encode() + b"\n")

@@ -3,7 +3,6 @@
 Shapes: M points of the scan, W working points: all of them, or an even sample of a large scan.
 """
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from adaafford.scans import Scan, estimated_normals
+from adaafford.scans import Scan, estimated_normals, npz_of
 from shared.errors import UsageError
 from shared.io.files import create_exclusively, write_atomically
 from shared.types import Float
@@ -162,31 +161,3 @@ class Marking:
 
     def _of_all(self) -> Mask:
         return self.movable[self._tree.query(self.scan.points)[1]]
-
-
-def npz_of(scan: Scan) -> bytes:
-    """A scan as NPZ. Points that were not measured are 0 0 0, so that all others keep their rows."""
-    rows = np.arange(len(scan.points)) if scan.rows is None else scan.rows
-    total = len(scan.points) + scan.missing
-
-    def in_rows(values: NDArray[np.generic]) -> NDArray[np.generic]:
-        every = np.zeros((total, *values.shape[1:]), values.dtype)
-        every[rows] = values
-        return every
-
-    arrays = {"points": in_rows(_narrow(scan.points))}
-    if scan.normals is not None:
-        arrays["normals"] = in_rows(_narrow(scan.normals))
-    if scan.movable is not None:
-        arrays["movable"] = in_rows(scan.movable)
-    if scan.camera is not None:
-        arrays["camera"] = np.array(scan.camera)
-    held = io.BytesIO()
-    np.savez_compressed(held, allow_pickle=False, **arrays)
-    return held.getvalue()
-
-
-def _narrow(values: Float) -> NDArray[np.generic]:
-    """The same numbers in single precision where that loses nothing."""
-    short = values.astype(np.float32)
-    return short if (short == values).all() else values
