@@ -8,7 +8,7 @@ from cluster.config.campaign_config import SplitConfig
 from cluster.config.selection import ObjectSelection
 from collector.objects.catalogue import Catalogue, ObjectSplit, for_task, of_categories, read_list, scan, split
 from collector.objects.files import short
-from collector.objects.procedural.catalogue import CATEGORIES
+from collector.objects.procedural.catalogue import CATEGORIES, categories_of
 from collector.objects.procedural.writing import generate
 from shared.categories import expanded
 from shared.errors import UsageError
@@ -86,7 +86,7 @@ def built_in_categories(task: Task, categories: tuple[str, ...]) -> list[str]:
         UsageError: an unknown category, or none of those that are named suits the task.
     """
     named = expanded(categories) or tuple(CATEGORIES)
-    allowed = [name for name in CATEGORIES if not task.categories or name in task.categories]
+    allowed = categories_of(task)
     suited = [name for name in named if name in allowed]
     wrong = next((name for name in named if name not in CATEGORIES), None if suited else named[0])
     if wrong is not None:

@@ -23,7 +23,7 @@ from collector.gym.spaces import (
     outcome_info,
     outcome_of,
 )
-from collector.objects.procedural import CATEGORIES, generate
+from collector.objects.procedural import categories_of, generate
 from collector.recorder import interact
 from collector.rollout import Start
 from collector.sim.camera import EmbreeCamera
@@ -257,7 +257,6 @@ class _Given:
 
 def _procedural(task: Task) -> dict[str, int]:
     """How many procedural objects there are of each category."""
-    categories = [name for name in CATEGORIES if not task.categories or name in task.categories]
-    if not categories:
+    if not (categories := categories_of(task)):
         raise UsageError(f"no procedural object is of a category of the task '{task.name}'; name a folder of objects")
     return dict.fromkeys(categories, PER_CATEGORY)

@@ -23,6 +23,7 @@ from collector.objects.procedural.containers import (
 from collector.objects.procedural.faucets import random_faucet
 from collector.objects.procedural.openings import random_door, random_switch, random_window
 from shared.seeds import generator
+from shared.tasks import Task
 
 CATEGORIES: Mapping[str, Callable[[np.random.Generator], ObjectModel]] = {
     "StorageFurniture": random_storage_furniture,
@@ -42,6 +43,11 @@ CATEGORIES: Mapping[str, Callable[[np.random.Generator], ObjectModel]] = {
     "Safe": random_safe,
 }
 """The paper's fifteen, called as PartNet-Mobility calls them."""
+
+
+def categories_of(task: Task) -> list[str]:
+    """The categories that a task applies to."""
+    return [name for name in CATEGORIES if not task.categories or name in task.categories]
 
 
 def build(category: str, seed: int, index: int) -> ObjectModel:
