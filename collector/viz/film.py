@@ -15,7 +15,7 @@ from collector.sim.grippers import GRIPPERS
 from collector.stopwatch import StageClock
 from collector.viz.playback import Playback, RecordedTrial, caption
 from collector.viz.preview import save
-from collector.viz.rendering import Picture, Renderer, with_most_of_the_hand
+from collector.viz.rendering import Picture, Renderer, View, with_most_of_the_hand
 from shared import seeds
 from shared.config import PANDA, CollectionConfig
 from shared.errors import UsageError
@@ -125,5 +125,5 @@ def _pictures(take: Playback) -> list[Picture]:
     """The moments from the side that shows more of the hand, the camera on the touched point."""
     places = [take.seen_from(side, ELEVATION_DEG, DISTANCE) for side in SIDES_DEG]
     place = with_most_of_the_hand(take, places, FIELD_OF_VIEW_DEG)
-    renderer = Renderer(take, place, IMAGE_SIZE, IMAGE_SIZE, FIELD_OF_VIEW_DEG)
+    renderer = Renderer(take, View(place, IMAGE_SIZE, IMAGE_SIZE, FIELD_OF_VIEW_DEG))
     return [renderer.picture(frame) for frame in take.moments.values()]

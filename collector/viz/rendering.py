@@ -1,6 +1,7 @@
 """Pictures of the frames of a playback: object and hand on white ground, with outlines, and shadows of one light."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,23 @@ GROUND = -1
 """Label of pixels that see no body."""
 
 
+@dataclass(frozen=True, slots=True)
+class View:
+    """What a camera sees.
+
+    Attributes:
+        world_from_camera: [4, 4].
+        width: of the pictures, pixels.
+        height: likewise.
+        field_of_view_deg: horizontal.
+    """
+
+    world_from_camera: Float
+    width: int
+    height: int
+    field_of_view_deg: float
+
+
 class Renderer:
     """Draws the frames of a playback from one place.
 
@@ -39,25 +57,20 @@ class Renderer:
 
     Args:
         playback: what is drawn.
-        world_from_camera: [4, 4].
-        width: of the pictures, pixels.
-        height: likewise.
-        field_of_view_deg: horizontal.
+        view: from where, and how large.
     """
 
-    def __init__(
-        self, playback: Playback, world_from_camera: Float, width: int, height: int, field_of_view_deg: float
-    ) -> None:
+    def __init__(self, playback: Playback, view: View) -> None:
         scenery = playback.scenery()
         self._poses = np.stack([playback.poses(frame) for frame in range(len(playback.times))])
         moves = (np.ptp(self._poses, axis=0) > 0).any(axis=(1, 2))
         self._moving, still = np.flatnonzero(moves), np.flatnonzero(~moves)
         self._vertices = [_vertices(scenery.bodies[number]) for number in self._moving]
         self._colours = body_colours(len(playback.target.parts), len(playback.hand)).astype(np.float32)
-        self._shape = height * SAMPLES, width * SAMPLES
-        config = CameraConfig(image_size=width * SAMPLES, field_of_view_deg=field_of_view_deg)
+        self._shape = view.height * SAMPLES, view.width * SAMPLES
+        config = CameraConfig(image_size=view.width * SAMPLES, field_of_view_deg=view.field_of_view_deg)
         self._back, self._front = (
-            EmbreeCamera(_only(scenery, numbers), world_from_camera, config, height * SAMPLES)
+            EmbreeCamera(_only(scenery, numbers), view.world_from_camera, config, view.height * SAMPLES)
             for numbers in (still, self._moving)
         )
         self._still_poses = self._poses[0, still]
@@ -138,26 +151,19 @@ class Renderer:
         return np.asarray(np.round(mean * (255 / SAMPLES**2)), dtype=np.uint8)
 
 
-def fitted(playback: Playback, world_from_camera: Float, width: int, height: int, field_of_view_deg: float) -> Float:
-    """The pose of a camera that looks the same way, [4, 4], from where object and hand are in the picture throughout.
-
-    Args:
-        playback: what is drawn.
-        world_from_camera: [4, 4].
-        width: of the pictures, pixels.
-        height: likewise.
-        field_of_view_deg: horizontal.
-    """
+def fitted(playback: Playback, view: View) -> View:
+    """A view in the same direction, from where object and hand are in the picture throughout."""
+    pose = view.world_from_camera
     vertices = [_vertices(body) for body in playback.scenery().bodies]
     world = np.concatenate([_placed(vertices, playback.poses(frame)) for frame in playback.moments.values()])
-    seen = world @ world_from_camera[:3, :3]
-    reach = np.tan(np.deg2rad(field_of_view_deg) / 2) / MARGIN * np.array([1.0, height / width])
+    seen = world @ pose[:3, :3]
+    reach = np.tan(np.deg2rad(view.field_of_view_deg) / 2) / MARGIN * np.array([1.0, view.height / view.width])
     # A camera at `back` along its axis sees a point if |across - centre| <= reach * (forward - back), on both axes.
     low, high = (seen[:, 1:] + reach * seen[:, :1]).min(axis=0), (seen[:, 1:] - reach * seen[:, :1]).max(axis=0)
     back = ((low - high) / (2 * reach)).min()
-    place = world_from_camera.copy()
-    place[:3, 3] = world_from_camera[:3, :3] @ np.array([back, *(low + high) / 2])
-    return place
+    place = pose.copy()
+    place[:3, 3] = pose[:3, :3] @ np.array([back, *(low + high) / 2])
+    return replace(view, world_from_camera=place)
 
 
 def with_most_of_the_hand(playback: Playback, places: Iterable[Float], field_of_view_deg: float) -> Float:

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from collector.viz.playback import Playback
-from collector.viz.rendering import Picture, Renderer, fitted, with_most_of_the_hand
+from collector.viz.rendering import Picture, Renderer, View, fitted, with_most_of_the_hand
 from shared.errors import UsageError
 from shared.extras import require_packages
 from shared.io.files import write_atomically
@@ -74,11 +74,10 @@ class Clip:
     def pictures(self, frames: Sequence[int]) -> Iterator[Picture]:
         """The pictures of some frames; whatever is after the end shows the end."""
         playback, width = self.playback, WIDTH - CLOSE_UP
-        views = [playback.seen_from(side, ELEVATION_DEG, CLOSE_UP_DISTANCE) for side in SIDES_DEG]
-        view = with_most_of_the_hand(playback, views, CLOSE_UP_DEG)
-        place = fitted(playback, view, width, HEIGHT, FIELD_OF_VIEW_DEG)
-        whole = Renderer(playback, place, width, HEIGHT, FIELD_OF_VIEW_DEG)
-        near = Renderer(playback, view, CLOSE_UP, CLOSE_UP, CLOSE_UP_DEG)
+        places = [playback.seen_from(side, ELEVATION_DEG, CLOSE_UP_DISTANCE) for side in SIDES_DEG]
+        place = with_most_of_the_hand(playback, places, CLOSE_UP_DEG)
+        whole = Renderer(playback, fitted(playback, View(place, width, HEIGHT, FIELD_OF_VIEW_DEG)))
+        near = Renderer(playback, View(place, CLOSE_UP, CLOSE_UP, CLOSE_UP_DEG))
         last, drawn = len(playback.times) - 1, -1
         picture = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
         for frame in (min(frame, last) for frame in frames):

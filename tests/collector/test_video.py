@@ -14,7 +14,7 @@ from collector.objects.catalogue import load_ref, scan
 from collector.objects.procedural import generate
 from collector.viz import video
 from collector.viz.playback import Playback, record
-from collector.viz.rendering import Renderer, fitted
+from collector.viz.rendering import Renderer, View, fitted
 from collector.worker import Worker
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import UsageError
@@ -202,8 +202,8 @@ def test_pictures_are_the_same_again_and_only_the_hand_and_its_part_move(collect
     rollout = collected.read_rollouts(collected.committed()[0].shard_id)[0]
     target = load_ref(objects, rollout.object, collection.collision)
     playback = record(target, collection, rollout, rollout.interactions[0], 5)
-    place = fitted(playback, playback.seen_from(50.0, 25.0, 1.0), 96, 64, 30.0)
-    first, again = (Renderer(playback, place, 96, 64, 30.0) for _ in range(2))
+    view = fitted(playback, View(playback.seen_from(50.0, 25.0, 1.0), 96, 64, 30.0))
+    first, again = (Renderer(playback, view) for _ in range(2))
     start = first.picture(0)
     end = first.picture(len(playback.times) - 1)
     assert (start == again.picture(0)).all()
