@@ -1,7 +1,7 @@
 """Heatmaps: a cloud with the affordance of each point, as PLY for viewers, NPZ for programs, HTML for people."""
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from shared.errors import UsageError
 from shared.io.files import write_atomically
 from shared.types import Float, Float32
+
+_HEAT = ((30, 60, 140), (245, 245, 245), (200, 20, 30))
 
 
 def write_heatmap(path: Path, points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> None:
@@ -44,9 +46,19 @@ def heatmap_writer(path: Path) -> Callable[[Float, Float32, NDArray[np.uint32]],
 
 def colours(affordance: Float32) -> NDArray[np.uint8]:
     """From dark blue (0) over white (0.5) to red (1), [N, 3]."""
-    low, middle, high = np.array([[30, 60, 140], [245, 245, 245], [200, 20, 30]], dtype=np.float64)
-    share = np.clip(affordance, 0.0, 1.0)[:, None].astype(np.float64)
-    mixed = np.where(share < 0.5, low + 2 * share * (middle - low), middle + (2 * share - 1) * (high - middle))
+    return blended(_HEAT, affordance)
+
+
+def blended(stops: Sequence[Sequence[int]], shares: Float | Float32) -> NDArray[np.uint8]:
+    """Colours on a scale, [N, 3].
+
+    Args:
+        stops: colours at equal distances, from share 0 to share 1.
+        shares: [N]; beyond the scale, its ends count.
+    """
+    scale = np.array(stops, dtype=np.float64)
+    places = np.clip(shares, 0.0, 1.0).astype(np.float64) * (len(scale) - 1)
+    mixed = np.stack([np.interp(places, np.arange(len(scale)), channel) for channel in scale.T], axis=1)
     rounded: NDArray[np.uint8] = np.rint(mixed).astype(np.uint8)
     return rounded
 

@@ -9,6 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from adaafford.heatmaps import blended
 from shared.policies.adaptation import Adapter, movable_points
 from shared.policies.policy import Policy
 from shared.records import InteractionRecord, RolloutRecord
@@ -132,7 +133,6 @@ def part_colours(observation: Observation) -> Colours:
 def value_colours(values: Float32, within: Range, movable: NDArray[np.bool_], quantity: Quantity) -> Colours:
     """Colours of values, [N, 3]; points that the task does not move are grey."""
     low, high = within
-    stops = np.array(_DIVERGING if quantity is Quantity.CHANGE else _VIRIDIS, dtype=np.float64)
-    share = np.clip((values.astype(np.float64) - low) / (high - low), 0.0, 1.0) * (len(stops) - 1)
-    mixed = np.stack([np.interp(share, np.arange(len(stops)), channel) for channel in stops.T], axis=1)
-    return np.where(movable[:, None], np.rint(mixed), BODY).astype(np.uint8)
+    stops = _DIVERGING if quantity is Quantity.CHANGE else _VIRIDIS
+    shown = blended(stops, (values.astype(np.float64) - low) / (high - low))
+    return np.where(movable[:, None], shown, BODY).astype(np.uint8)
