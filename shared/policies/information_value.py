@@ -16,12 +16,11 @@ from torch import Tensor
 
 from shared.policies.adaptation import Adapter, action_from_frame, movable_points
 from shared.policies.methods import ProposerKind
+from shared.policies.proposers import TOP_POINTS, best_points
 from shared.types import Action, Interaction, Observation
 
 CANDIDATES = 32
 """Half of them among the points that AAP thinks most of, the others anywhere."""
-ACTIONABLE_POINTS = 100
-"""As many as an exploit chooses from."""
 BEST = 6
 """The value is the mean belief in so many candidates."""
 USUAL_MOTION = 0.03
@@ -50,7 +49,7 @@ class InformationValueProposer:
     def _points(self, observation: Observation, history: Sequence[Interaction]) -> NDArray[np.int64]:
         movable = movable_points(observation)
         actionability = self.adapter.affordance(observation, history, points=movable)
-        actionable = movable[np.argsort(-actionability, kind="stable")[:ACTIONABLE_POINTS]]
+        actionable = best_points(movable, actionability, TOP_POINTS)
         drawn = np.concatenate([self.rng.permutation(actionable)[: CANDIDATES // 2], self.rng.permutation(movable)])
         _, first = np.unique(drawn, return_index=True)
         return drawn[np.sort(first)[:CANDIDATES]]

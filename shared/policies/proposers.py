@@ -113,9 +113,13 @@ def points_of(share: float, observation: Observation) -> int:
 
 def drawn_point(candidates: NDArray[np.int64], scores: Float32, count: int, rng: np.random.Generator) -> int:
     """One of the `count` candidates with the highest scores, at random; `candidates` and `scores`: [C]."""
+    return int(rng.choice(best_points(candidates, scores, count)))
+
+
+def best_points(candidates: NDArray[np.int64], scores: Float32, count: int) -> NDArray[np.int64]:
+    """The `count` candidates with the highest scores, best first; `candidates` and `scores`: [C]."""
     # A stable sort makes the choice among equal scores independent of the machine.
-    best_first = candidates[np.argsort(-scores, kind="stable")]
-    return int(rng.choice(best_first[:count]))
+    return candidates[np.argsort(-scores, kind="stable")][:count]
 
 
 def proposer_named(
