@@ -108,8 +108,8 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _rollouts(store: Store) -> Iterator[RolloutRecord]:
-    for job in store.jobs():
-        yield from store.read_rollouts(job.shard_id)
+    for part in store.parts():
+        yield from store.rollouts_of(part)
 
 
 def _mujoco_scene(plan: Plan, folder: Path, store: Store, out: Path) -> Path:
