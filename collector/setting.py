@@ -6,11 +6,10 @@ from typing import Any
 from collector.sim.grippers import GRIPPERS
 from collector.sim.simulator import SIMULATORS
 from shared.config import FIDELITIES, CollectionConfig, Fidelity
-from shared.errors import StoreError, UsageError
+from shared.errors import UsageError
 from shared.extensions import added_by_packages
 from shared.plan import EvaluationConfig, Setting, found_by_name
 from shared.primitives import PRIMITIVES
-from shared.store import Store
 from shared.tasks import TASKS, Task
 
 logger = logging.getLogger(__name__)
@@ -72,15 +71,16 @@ def check_packages(setting: Setting) -> None:
         raise UsageError(f"the store is of {wanted}, but here is {found}; install the same on every machine")
 
 
-def in_fidelity_of(where: str, collection: CollectionConfig) -> CollectionConfig:
-    """`collection`, which asks for the default fidelity, in the one that was the default when a store was begun."""
-    if collection.fidelity != FIDELITIES["fast"]:
+def in_fidelity_of(where: str, begun: Setting | None, collection: CollectionConfig) -> CollectionConfig:
+    """`collection`, which asks for the default fidelity, in the one that was the default when a store was begun.
+
+    Args:
+        where: place of the store, for the warning.
+        begun: the store's setting; None: there is no store yet.
+        collection: what is asked for.
+    """
+    if begun is None or collection.fidelity != FIDELITIES["fast"] or begun.collection.fidelity != Fidelity():
         return collection
-    try:
-        begun = Store.open(where).setting.collection.fidelity
-    except StoreError:  # There is none yet, or what is wrong with it is said when it is made.
-        return collection
-    if begun != Fidelity():
-        return collection
-    logger.warning("%s: was begun with fidelity version %d; it goes on with that", where, begun.version)
-    return collection.model_copy(update={"fidelity": begun})
+    fidelity = begun.collection.fidelity
+    logger.warning("%s: was begun with fidelity version %d; it goes on with that", where, fidelity.version)
+    return collection.model_copy(update={"fidelity": fidelity})

@@ -162,9 +162,10 @@ def _evaluate(
     out: Path | None,
 ) -> None:
     """Do what is left of the trials on objects of a folder, and print the table."""
+    place = None if out is None else str(out / "store")
     setting = make_setting(
         task,
-        subject.collection if out is None else in_fidelity_of(str(out / "store"), subject.collection),
+        subject.collection if place is None else in_fidelity_of(place, Store.begun_with(place), subject.collection),
         kind="evaluation",
         seed=seed if settings.seed is None else settings.seed,
         objects=refs,

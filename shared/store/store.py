@@ -130,6 +130,14 @@ class Store:
             raise StoreError(f"{where}: is no store (it has no {STORE_FILE}); name an existing store")
         return cls(backend, parse_store_document(backend.read(STORE_FILE, MAX_DOCUMENT_BYTES), f"{where}/{STORE_FILE}"))
 
+    @classmethod
+    def begun_with(cls, where: str | Path) -> Setting | None:
+        """The setting of the store that is there; None: there is none, or none that opens, as `open` then says."""
+        try:
+            return cls.open(where).setting
+        except StoreError:
+            return None
+
     def as_of(self, snapshot: Snapshot) -> "Store":
         """The store restricted to these rollouts, for readers while others collect into it."""
         store = Store(self.backend, self.document)

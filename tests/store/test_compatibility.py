@@ -152,9 +152,9 @@ def test_only_who_asks_for_the_default_fidelity_goes_on_with_that_of_a_store(tmp
     for name, setting in (("newer", SETTING), ("older", older)):
         Store.create(tmp_path / name, setting)
     other = CollectionConfig(fidelity=Fidelity(version=2, solver_iterations=30))
-    found = [in_fidelity_of(str(tmp_path / name), default) for name in ("newer", "older", "none")]
+    found = [in_fidelity_of(name, Store.begun_with(tmp_path / name), default) for name in ("newer", "older", "none")]
     assert found == [default, first, default]
-    assert in_fidelity_of(str(tmp_path / "older"), other) == other
+    assert in_fidelity_of("older", Store.begun_with(tmp_path / "older"), other) == other
 
 
 def test_a_run_a_policy_and_a_history_of_the_first_version_open(

@@ -13,12 +13,12 @@ from pydantic import Field
 from cluster.config.flags import early_flags, layered, parse_flags
 from cluster.config.selection import ObjectSelection, RayAddress
 from shared.config import CollectionConfig
-from shared.errors import StoreError, UsageError
+from shared.errors import UsageError
 from shared.plan import ROLLOUTS_PER_SHARD
 from shared.policies.methods import RANDOM, needs_policy
 
 if TYPE_CHECKING:
-    from shared.plan import ObjectRef
+    from shared.plan import ObjectRef, Setting
 
 logger = logging.getLogger(__name__)
 
@@ -87,16 +87,11 @@ def main(args: list[str]) -> int:
     return 0
 
 
-def _begun_with(where: str, found: "tuple[ObjectRef, ...]") -> "tuple[ObjectRef, ...]":
+def _begun_with(where: str, begun: "Setting | None", found: "tuple[ObjectRef, ...]") -> "tuple[ObjectRef, ...]":
     """The objects that a store was begun with, if all of them are found; a later release may find usable ones more."""
-    from shared.store import Store
-
-    try:
-        known = Store.open(where).setting.objects
-    except StoreError:  # There is none yet, or what is wrong with it is said when it is made.
+    if begun is None or not set(begun.objects) < set(found):
         return found
-    if not set(known) < set(found):
-        return found
+    known = begun.objects
     logger.warning(
         "%s: was begun with %d of the %d objects that can be used; it goes on with these alone",
         where,
@@ -129,11 +124,12 @@ def run_collection(command: CollectCommand) -> None:
         chosen.procedural_per_category,
         chosen.seed,
     )
+    begun = Store.begun_with(where)
     setting = make_setting(
         task,
-        in_fidelity_of(where, chosen.collection),
+        in_fidelity_of(where, begun, chosen.collection),
         seed=chosen.seed,
-        objects=_begun_with(where, tuple(entry.ref for entry in catalogue.usable)),
+        objects=_begun_with(where, begun, tuple(entry.ref for entry in catalogue.usable)),
     )
     store = Store.create(where, setting)
     if changed := changed_versions(store.document.software):
