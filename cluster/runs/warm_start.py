@@ -46,15 +46,21 @@ def fit_to_start_from(source: str, task: str) -> Policy:
     return policy
 
 
-def with_needed_depth(config: CampaignConfig) -> CampaignConfig:
+def with_needed_depth(config: CampaignConfig, out: Path | None = None) -> CampaignConfig:
     """A campaign that keeps depth images where its networks need them.
+
+    Args:
+        config: of the campaign.
+        out: folder of its run. What the run has adopted is not looked for where it came from any more.
 
     Raises:
         UsageError: its camera cannot keep them, or there is no policy to start from.
     """
     learned = config.learner.network.pinch_profile
     if config.start_from is not None:
-        learned = fit_to_start_from(config.start_from, config.task).config.pinch_profile
+        adopted = None if out is None else RunFolder(out).adopted
+        there = adopted is not None and (adopted / DONE_FILE).is_file()
+        learned = fit_to_start_from(str(adopted) if there else config.start_from, config.task).config.pinch_profile
     return config.model_copy(update={"collection": config.collection.keeping_depth()}) if learned else config
 
 

@@ -1,6 +1,7 @@
 """Learning with pinch profiles: rows, pools and policies are told the same of an action."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 import torch
 
 from cluster.config.campaign_config import CampaignConfig
-from cluster.runs.warm_start import with_needed_depth
+from cluster.runs.run_folder import RunFolder
+from cluster.runs.warm_start import warm_start, with_needed_depth
 from learner.data.augmentation import draw_flips
 from learner.data.dataset import load_dataset
 from learner.data.features import FrozenFeatures, ProposalPool
@@ -153,6 +155,12 @@ def test_a_campaign_keeps_the_depth_images_that_its_networks_need(tmp_path: Path
             {"learner": learner, "start_from": str(tmp_path / source), "task": "push"}
         )
         assert with_needed_depth(started).collection.camera.keep_depth == needed
+        # A run that has adopted it goes on without the place that it came from.
+        warm_start(str(tmp_path / source), "push", RunFolder(tmp_path / f"run-{source}").adopted)
+        shutil.rmtree(tmp_path / source)
+        with pytest.raises(UsageError):
+            with_needed_depth(started, tmp_path / "another")
+        assert with_needed_depth(started, tmp_path / f"run-{source}").collection.camera.keep_depth == needed
     large = {"learner": learner, "collection": {"camera": {"image_size": 4096}}}
     with pytest.raises(UsageError, match=r"collection\.camera.*keep_depth needs an image_size of at most"):
         with_needed_depth(CampaignConfig.model_validate(large))

@@ -45,7 +45,7 @@ def main(args: list[str]) -> int:
         check_baselines(command.settings.learner)
     from cluster.runs.warm_start import with_needed_depth
 
-    settings = with_needed_depth(command.settings)
+    settings = with_needed_depth(command.settings, command.out)
     if command.dry_run:
         from cluster.campaign.estimate import RATES, estimate, print_estimate
 
