@@ -11,7 +11,7 @@ import secrets
 import signal
 import socket
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,8 @@ ANSWER_S = 5.0
 """How long a cluster may take to answer."""
 AGENTS_S = 10.0
 """How long Ray's agents, which write to the session's folder, may take to end after it."""
+START_ATTEMPTS = 2
+"""How often Ray is started before a session is given up: Ray allows itself 30 s, too few for a busy machine."""
 RAY_PREFIX = "RAY_"
 """Of the environment variables that Ray reads."""
 
@@ -132,7 +134,7 @@ def ray_session(workers: int, address: str | None = None) -> Iterator[None]:
 
     Raises:
         UsageError: there is no cluster at `address`, or no private folder for a session of our own.
-        WorkerError: a session of our own does not come up; Ray allows it 30 s, too few for a machine under heavy load.
+        WorkerError: a session of our own does not come up, however often it is tried.
     """
     on_terminate = signal.getsignal(signal.SIGTERM)
     with _private_session(workers) if address is None else _cluster(address):
@@ -216,10 +218,35 @@ def _private_session(workers: int) -> Iterator[None]:
     except FileNotFoundError:
         raise UsageError("the current folder has been removed; change into one that is there") from None
     # For as long as the session lives, since Ray reads some of them late.
-    with without_foreign_settings(), _session_folder() as folder:
+    with without_foreign_settings(), ExitStack() as session:
+        for attempt in range(START_ATTEMPTS):
+            try:
+                session.enter_context(_started_session(workers))
+                break
+            except WorkerError as error:
+                if attempt + 1 == START_ATTEMPTS:
+                    raise
+                logger.warning("%s; starting it again", str(error).partition(";")[0])
+        yield
+
+
+@contextmanager
+def _started_session(workers: int) -> Iterator[None]:
+    """A session in a folder of its own; of one that does not come up, no process and no folder is left.
+
+    Raises:
+        WorkerError: it does not come up.
+    """
+    with _session_folder() as folder:
         token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
         with _changed_environment({**_ENVIRONMENT, **token}), _ray() as ray:
-            _start_on_loopback(workers, folder)
+            others = psutil.Process().children(recursive=True)
+            try:
+                _start_on_loopback(workers, folder)
+            except WorkerError:
+                ray.shutdown()
+                _kill(set(psutil.Process().children(recursive=True)) - set(others))
+                raise
         try:
             yield
         finally:
@@ -259,6 +286,13 @@ def _start_on_loopback(workers: int, folder: Path) -> None:
         raise WorkerError(f"Ray did not start ({said}); run the same command again, or with --workers 0") from error
     finally:
         ray_constants.ENABLE_RAY_CLUSTER = clusters
+
+
+def _kill(processes: Iterable[psutil.Process]) -> None:
+    for process in processes:
+        with suppress(psutil.NoSuchProcess):
+            process.kill()
+    psutil.wait_procs(processes, AGENTS_S)
 
 
 def _processes_of_ray() -> list[psutil.Process]:

@@ -157,8 +157,8 @@ def test_every_session_has_a_token_of_its_own(sessions: Path, monkeypatch: pytes
     for _ in range(2):
         with pytest.raises(WorkerError), ray_session(1):
             pass
-    assert [len(token) for token in tokens] == [64, 64]
-    assert tokens[0] != tokens[1]
+    assert {len(token) for token in tokens} == {64}
+    assert len(set(tokens)) == len(tokens) == 2 * session.START_ATTEMPTS
 
 
 def test_benchmarks_import_ray_without_foreign_settings(
@@ -332,9 +332,35 @@ def test_folders_of_killed_sessions_go_and_those_of_live_ones_stay(sessions: Pat
 
 
 def test_a_session_that_does_not_come_up_is_said_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+
     def late(**settings: object) -> None:
+        tried.append(settings["_temp_dir"])
         raise Exception("The current node timed out during startup.\nraylet failed")
 
     monkeypatch.setattr("ray.init", late)
     with pytest.raises(WorkerError, match=r"timed out during startup\.\); run the same command again"), ray_session(1):
         pass
+    assert len(set(tried)) == session.START_ATTEMPTS
+
+
+def test_a_session_that_does_not_come_up_at_first_is_started_again_and_leaves_no_process(
+    sessions: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    import ray
+
+    init, left = ray.init, list[subprocess.Popen[bytes]]()
+
+    def late(**settings: Any) -> None:
+        if not left:
+            left.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]))
+            raise Exception("The current node timed out during startup.")
+        init(**settings)
+
+    monkeypatch.setattr("ray.init", late)
+    with ray_session(1):
+        assert ray.is_initialized()
+        assert left[0].poll() is not None
+        assert len(list(sessions.iterdir())) == 1
+    assert "timed out during startup.); starting it again" in caplog.text
+    assert list(sessions.iterdir()) == []
