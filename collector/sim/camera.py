@@ -1,11 +1,12 @@
 """Depth cameras: what of an articulated object can be seen from one place, and the cloud that is kept of it."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from embreex import rtcore_scene
+from embreex import rtcore, rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from numpy.typing import NDArray
 
@@ -151,7 +152,7 @@ class _BodyScene:
             count += len(mesh.vertices)
         triangles = np.concatenate(faces)
         self.vertices = np.concatenate(vertices) if len(triangles) else np.zeros((0, 3))
-        self._scene = rtcore_scene.EmbreeScene()
+        self._scene = rtcore_scene.EmbreeScene(_embree_device())
         if len(triangles):
             TriangleMesh(self._scene, self.vertices.astype(np.float32), triangles.astype(np.int32))
 
@@ -187,6 +188,12 @@ class _BodyScene:
             query="OCCLUDED",
         )
         return np.asarray(hits) >= 0
+
+
+@cache
+def _embree_device() -> rtcore.EmbreeDevice:
+    """The one that all scenes of this process share: each device has threads of its own, and some 1,500 crash Embree."""
+    return rtcore.EmbreeDevice()
 
 
 _SCENES: WeakKeyDictionary[ArticulatedObject, tuple[_BodyScene, ...]] = WeakKeyDictionary()

@@ -1,5 +1,7 @@
 """What the camera sees of objects whose right answers are known by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -82,3 +84,10 @@ def test_looking_away_sees_nothing() -> None:
     image = EmbreeCamera(drawer(), away, CONFIG).capture(np.zeros(1))
     assert len(image.pixels) == 0
     assert observation_from(image, away, (1,), CONFIG, np.random.default_rng(0)) is None
+
+
+def test_a_process_sees_thousands_of_bodies_at_once() -> None:
+    target = door()
+    cameras = [EmbreeCamera(replace(target), FRONT, CONFIG) for _ in range(1200)]
+    for camera in (cameras[0], cameras[-1]):
+        assert len(camera.capture(np.zeros(1)).pixels) == len(look().pixels)
