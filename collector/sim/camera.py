@@ -192,7 +192,7 @@ class _BodyScene:
 
 @cache
 def _embree_device() -> rtcore.EmbreeDevice:
-    """The one that all scenes of this process share: each device has threads of its own, and some 1,500 crash Embree."""
+    """The device of all scenes of this process: each device has threads of its own, and some 1,500 crash Embree."""
     return rtcore.EmbreeDevice()
 
 

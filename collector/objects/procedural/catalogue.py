@@ -10,7 +10,6 @@ from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import (
     random_refrigerator,
     random_safe,
-    random_storage_furniture,
     random_table,
 )
 from collector.objects.procedural.containers import (
@@ -21,12 +20,13 @@ from collector.objects.procedural.containers import (
     random_trash_can,
 )
 from collector.objects.procedural.faucets import random_faucet
+from collector.objects.procedural.fitted import random_cabinet
 from collector.objects.procedural.openings import random_door, random_switch, random_window
 from shared.seeds import generator
 from shared.tasks import Task
 
 CATEGORIES: Mapping[str, Callable[[np.random.Generator], ObjectModel]] = {
-    "StorageFurniture": random_storage_furniture,
+    "StorageFurniture": random_cabinet,
     "Faucet": random_faucet,
     "Box": random_box,
     "Microwave": random_microwave,
