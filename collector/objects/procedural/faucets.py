@@ -1,12 +1,21 @@
 """Faucets: a column, a spout, and one or two switches whose turning direction cannot be seen."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
-from collector.objects.procedural.shapes import BOTTOM, TOP, block, moved, rod
+from collector.objects.procedural.shapes import BOTTOM, LEFT, RIGHT, TOP, block, moved, rod
 
 
 def random_faucet(rng: np.random.Generator) -> ObjectModel:
+    """A faucet whose switches turn about the vertical, or one whose switches are at its sides, equally often."""
+    # The draws of the first do not depend on those of the others.
+    (aside,) = rng.spawn(1)
+    return _side_faucet(aside) if aside.random() < 0.5 else _upright_faucet(rng)
+
+
+def _upright_faucet(rng: np.random.Generator) -> ObjectModel:
     """One switch on top of the column, or two on pedestals beside it; the sense of each axis is drawn."""
     height, radius = float(rng.uniform(0.7, 1.1)), float(rng.uniform(0.08, 0.13))
     reach = float(rng.uniform(0.7, 1.0))
@@ -32,6 +41,47 @@ def random_faucet(rng: np.random.Generator) -> ObjectModel:
         turning = MovablePart("spout", "revolute", spout, (0.0, 0.0, height), TOP, np.pi / 2)
         return ObjectModel("Faucet", "faucet_base", body, (*switches, turning))
     return ObjectModel("Faucet", "faucet_base", body + spout, tuple(switches))
+
+
+def _side_faucet(rng: np.random.Generator) -> ObjectModel:
+    """A bent spout on a column, and switches that turn about horizontal axes at one side of it or at both."""
+    radius, height = float(rng.uniform(0.06, 0.1)), float(rng.uniform(0.3, 0.5))
+    middle, arm = height * float(rng.uniform(0.4, 0.75)), float(rng.uniform(0.05, 0.2))
+    body: Pieces = (
+        rod((0.0, 0.0, -0.05), (0.0, 0.0, 0.0), 1.6 * radius, sides=24),
+        rod((0.0, 0.0, 0.0), (0.0, 0.0, height), radius),
+    )
+    style = rng.choice(["lever", "lever", "cross"])
+    length, upper = float(rng.uniform(0.18, 0.35)), float(rng.uniform(0.4, 1.0) * np.pi)
+    tilt = float(rng.uniform(-0.4, 0.4))
+    switches = []
+    for side in (1.0, -1.0) if rng.random() < 0.4 else (1.0 if rng.random() < 0.5 else -1.0,):
+        stand = (0.0, side * (radius + arm), middle)
+        body += (rod((0.0, side * 0.8 * radius, middle), stand, 0.55 * radius),)
+        hub = rod((0.0, side * 0.005, 0.0), (0.0, side * 0.1, 0.0), 0.6 * radius)
+        angles = [tilt] if style == "lever" else list(np.pi * (np.arange(4) / 2 + 0.25))
+        reach = length if style == "lever" else 0.5 * length
+        start = (0.0, side * 0.07, 0.0)
+        arms = tuple(
+            rod(start, (reach * float(np.sin(a)), side * 0.09, reach * float(np.cos(a))), 0.025, 0.022, sides=10)
+            for a in angles
+        )
+        axis = LEFT if rng.random() < 0.5 else RIGHT
+        switches.append(MovablePart("switch", "revolute", moved((hub, *arms), stand), stand, axis, upper))
+    spout = _bent_spout(height, float(rng.uniform(0.3, 0.6)), float(rng.uniform(0.14, 0.26)), 0.5 * radius)
+    if rng.random() < 0.5:
+        turning = MovablePart("spout", "revolute", spout, (0.0, 0.0, height), TOP, np.pi / 2)
+        return ObjectModel("Faucet", "faucet_base", body, (*switches, turning))
+    return ObjectModel("Faucet", "faucet_base", body + spout, tuple(switches))
+
+
+def _bent_spout(height: float, rise: float, bend: float, radius: float) -> Pieces:
+    """A pipe up from the column's top, half a circle forward, and down to its mouth."""
+    top = height + rise
+    angles = np.pi * np.arange(9) / 8
+    points = [(bend * (float(np.cos(a)) - 1.0), 0.0, top + bend * float(np.sin(a))) for a in angles]
+    points = [(0.0, 0.0, height + 0.005), *points, (-2.0 * bend, 0.0, top - 0.5 * rise)]
+    return tuple(rod(start, end, radius, sides=10) for start, end in pairwise(points))
 
 
 def _spout(reach: float, height: float, radius: float) -> Pieces:
