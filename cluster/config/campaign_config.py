@@ -4,8 +4,8 @@ from pathlib import Path
 
 from pydantic import Field, field_validator, model_validator
 
-from cluster.config.selection import ObjectSelection, RayAddress
-from collector.watchdog import Limits
+from cluster.config.selection import ObjectSelection
+from cluster.config.worker_settings import WorkerSettings
 from learner.settings import LearnerSettings
 from shared.config import CollectionConfig, StrictModel
 from shared.plan import ROLLOUTS_PER_SHARD, EvaluationConfig
@@ -82,7 +82,7 @@ class ProceduralConfig(StrictModel):
     """Objects of each category that the task applies to."""
 
 
-class CampaignConfig(ObjectSelection):
+class CampaignConfig(WorkerSettings, ObjectSelection):
     """One campaign: a random round, then alternating training and AIP rounds, then evaluation on unseen objects."""
 
     task: str = "pull-closed-door"
@@ -100,15 +100,6 @@ class CampaignConfig(ObjectSelection):
     collection: CollectionConfig = CollectionConfig()
     learner: LearnerSettings = LearnerSettings()
     evaluation: EvaluationConfig = EvaluationConfig()
-    workers: int = Field(2, ge=0, le=4096)
-    """Ray actors, one CPU each; 0 does everything in one process without Ray."""
-    ray_address: RayAddress | None = None
-    """HOST:PORT of a running Ray cluster, or auto; default: a private session on this machine."""
-    rollout_limit_s: float = Field(300.0, gt=0)
-    """A worker that takes longer for one rollout is taken for hung, and replaced; after three times the rollout is
-    quarantined."""
-    memory_limit_mb: float = Field(2000.0, gt=0)
-    """What a worker may take beyond what it had after its start; at half of that it is replaced after its job."""
 
     @model_validator(mode="after")
     def _something_to_train(self) -> "CampaignConfig":
@@ -121,8 +112,3 @@ class CampaignConfig(ObjectSelection):
     def _found_from_anywhere(cls, source: str | None) -> str | None:
         """A run may be resumed from another working folder."""
         return str(Path(source).resolve()) if source is not None and Path(source).exists() else source
-
-    @property
-    def limits(self) -> Limits:
-        """Of a worker's process."""
-        return Limits(self.rollout_limit_s, self.memory_limit_mb)

@@ -2,13 +2,14 @@
 
 from pydantic import Field
 
-from cluster.config.selection import ObjectSelection, RayAddress
+from cluster.config.selection import ObjectSelection
+from cluster.config.worker_settings import WorkerSettings
 from shared.config import CollectionConfig
 from shared.plan import Budget
 from shared.policies.methods import MethodName
 
 
-class EvaluateSettings(ObjectSelection):
+class EvaluateSettings(WorkerSettings, ObjectSelection):
     """What is evaluated, on which objects, and by how many workers."""
 
     task: str | None = None
@@ -32,11 +33,5 @@ class EvaluateSettings(ObjectSelection):
     """Instead of the run's, or instead of 1."""
     per_shard: int = Field(4, ge=1, le=4096)
     """Trials a shard."""
-    workers: int = Field(2, ge=0, le=4096)
-    """Ray actors, one CPU each; 0 does everything in one process without Ray."""
-    ray_address: RayAddress | None = None
-    """HOST:PORT of a running Ray cluster, or auto; default: a private session on this machine."""
     rollout_limit_s: float = Field(600.0, gt=0)
     """A worker that takes longer for one trial is taken for hung, and replaced."""
-    memory_limit_mb: float = Field(2000.0, gt=0)
-    """What a worker may take beyond what it had after its start."""

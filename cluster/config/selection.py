@@ -4,20 +4,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from shared.config import StrictModel
 from shared.tasks import TASK_FILE_SUFFIX, Task, read_task, task_named
-
-
-def _without_credentials(address: str) -> str:
-    if "@" in address:
-        raise ValueError("an address may hold no user and password; Ray takes its token from RAY_AUTH_TOKEN")
-    return address
-
-
-RayAddress = Annotated[str, AfterValidator(_without_credentials)]
-"""Of a Ray cluster; it is kept and shown, so that it may hold no secret."""
 
 
 class ObjectSelection(StrictModel):

@@ -20,7 +20,6 @@ from cluster.runs.run_folder import RunFolder, find
 from cluster.runs.warm_start import folder_of, seen_by, unknown
 from cluster.workers.session import CurrentWorkerGroup, worker_groups
 from collector.setting import in_fidelity_of, make_setting
-from collector.watchdog import Limits
 from shared.config import CollectionConfig
 from shared.errors import UsageError
 from shared.io.text import plain
@@ -197,8 +196,7 @@ def _evaluate(
 
 def _execute(evaluation: Evaluation, settings: EvaluateSettings) -> None:
     console = Console(file=sys.stderr, highlight=False)
-    limits = Limits(settings.rollout_limit_s, settings.memory_limit_mb)
-    with worker_groups(settings.workers, limits, settings.ray_address) as make_worker_group:
+    with worker_groups(settings.workers, settings.limits, settings.ray_address) as make_worker_group:
         evaluation.execute(
             CurrentWorkerGroup(make_worker_group), lambda line: console.print(line, markup=False, soft_wrap=True)
         )

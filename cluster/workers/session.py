@@ -52,6 +52,10 @@ _ENVIRONMENT = {
 _SYSTEM = {"gcs_rpc_server_reconnect_timeout_s": 20}
 """The control store of a private session never comes back: it is given up after 20 s, not after 60. Not by a variable,
 which Ray's native part may fail to parse where it is loaded after SAPIEN."""
+_UNUSED = ("start_monitor", "start_log_monitor", "start_api_server")
+"""Methods of Ray's node that start its autoscaler, what follows its log files, and the server of its dashboard.
+
+A private session has no use for them, and each takes two seconds of a processor just when the workers start."""
 _ADDRESS = re.compile(r"(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
 _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 _SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
@@ -263,29 +267,41 @@ def _start_on_loopback(workers: int, folder: Path) -> None:
     """
     import ray
     from ray._private import ray_constants
+    from ray._private.node import Node
 
-    clusters = ray_constants.ENABLE_RAY_CLUSTER
-    ray_constants.ENABLE_RAY_CLUSTER = False
+    idle = {name: lambda self, **_: None for name in _UNUSED if hasattr(Node, name)}
     try:
-        ray.init(
-            address="local",
-            num_cpus=workers,
-            num_gpus=0,
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            logging_level=logging.ERROR,
-            log_to_driver=False,
-            _node_ip_address="127.0.0.1",
-            _temp_dir=str(folder),
-            _plasma_directory=None if _has_shared_memory() else str(folder),
-            _system_config=_SYSTEM,
-        )
+        with _changed_attributes(ray_constants, {"ENABLE_RAY_CLUSTER": False}), _changed_attributes(Node, idle):
+            ray.init(
+                address="local",
+                num_cpus=workers,
+                num_gpus=0,
+                include_dashboard=False,
+                object_store_memory=OBJECT_STORE_BYTES,
+                logging_level=logging.ERROR,
+                log_to_driver=False,
+                _node_ip_address="127.0.0.1",
+                _temp_dir=str(folder),
+                _plasma_directory=None if _has_shared_memory() else str(folder),
+                _system_config=_SYSTEM,
+            )
     except Exception as error:
         # Ray has no class of its own for a session that does not come up in its 30 s.
         said = str(error).partition("\n")[0]
         raise WorkerError(f"Ray did not start ({said}); run the same command again, or with --workers 0") from error
+
+
+@contextmanager
+def _changed_attributes(owner: Any, changes: Mapping[str, Any]) -> Iterator[None]:
+    """Attributes that are others meanwhile."""
+    before = {name: getattr(owner, name) for name in changes}
+    for name, value in changes.items():
+        setattr(owner, name, value)
+    try:
+        yield
     finally:
-        ray_constants.ENABLE_RAY_CLUSTER = clusters
+        for name, value in before.items():
+            setattr(owner, name, value)
 
 
 def _kill(processes: Iterable[psutil.Process]) -> None:

@@ -48,6 +48,9 @@ FOREIGN = {
 }
 """What a node, a job or a notebook of another cluster leaves in an environment, and worse."""
 
+UNUSED = ("monitor", "log_monitor", "dashboard")
+"""Programs of Ray that serve nobody in a private session, and slow its start down."""
+
 
 @pytest.fixture
 def scratch() -> Iterator[Path]:
@@ -91,6 +94,7 @@ def look_at_session() -> dict[str, Any]:
             "logs": any("raylet" in file.name for file in files),
             "argument": token in " ".join(commands),
             "servers": sum("raylet" in command for command in commands),
+            "unused": [each for each in commands if any(f"{name}.py" in each for name in UNUSED)],
             "modes": [oct(each.stat().st_mode & 0o777) for each in (folder, folder.parent)],
             "loopback_alone": all(ip_address(each.removeprefix("::ffff:")).is_loopback for each in listened_at()),
             "stranger": stranger_at(ray.get_runtime_context().gcs_address),
@@ -141,6 +145,7 @@ def test_a_private_session_is_private_whatever_the_environment_says(scratch: Pat
     assert found["written"] == [], "nobody needs the token but processes that are given it"
     assert not found["argument"]
     assert found["logs"] and found["servers"], "that was a session"
+    assert found["unused"] == []
     assert found["modes"] == ["0o700", "0o700"]
     assert found["loopback_alone"]
     assert found["stranger"].startswith("1  ") and "AuthenticationError" in found["stranger"]

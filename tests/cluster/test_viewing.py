@@ -15,6 +15,7 @@ from shared.errors import UsageError
 from shared.io import files
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
+from shared.store.backends.base import is_url
 from shared.types import OutcomeKind, Role
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting, fabricate_store
 from tests.support.small_policies import policy_of
@@ -23,14 +24,23 @@ RANDOM = Plan(setting=fabricate_setting())
 PROPOSED = Plan(setting=fabricate_setting(), proposer="aip", policy_version=2)
 
 
+@pytest.fixture(scope="module")
+def made() -> dict[str, str]:
+    """Where the store is of each kind of place, once there is one."""
+    return {}
+
+
 @pytest.fixture
-def store(where: str) -> Store:
-    """Seven rollouts of two plans in four shards."""
-    store = Store.create(where, RANDOM.setting)
-    for plan, start, stop in ((RANDOM, 0, 2), (RANDOM, 2, 4), (RANDOM, 4, 5), (PROPOSED, 0, 2)):
-        job = Job(plan.key, start, stop)
-        store.commit(plan, job, fabricate_rollouts(plan, job), {})
-    return store
+def store(where: str, made: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Seven rollouts of two plans in four shards, which tests only read."""
+    kind = "bucket" if is_url(where) else "disk"
+    if kind not in made:
+        made[kind] = where if kind == "bucket" else str(tmp_path_factory.mktemp("viewing") / "store")
+        store = Store.create(made[kind], RANDOM.setting)
+        for plan, start, stop in ((RANDOM, 0, 2), (RANDOM, 2, 4), (RANDOM, 4, 5), (PROPOSED, 0, 2)):
+            job = Job(plan.key, start, stop)
+            store.commit(plan, job, fabricate_rollouts(plan, job), {})
+    return Store.open(made[kind])
 
 
 def everything(browser: Browser) -> list[tuple[str, int]]:

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
+from shared.io import private
+from shared.policies import furthest_points as module
 from shared.policies.furthest_points import furthest_points
 
 
@@ -63,19 +66,29 @@ def test_furthest_points_that_are_equally_far_come_in_the_order_of_stored_data(
 
 
 def test_compiled_code_is_kept_in_the_cache_of_the_user_and_nowhere_without_a_home(tmp_path: Path) -> None:
-    script = (
-        "import numpy; from shared.policies.furthest_points import furthest_points as f; f(numpy.eye(3, dtype='f4'), 2)"
-    )
+    """Of a small function, since ours take seconds to compile."""
     here, cache, temporary = tmp_path / "here", tmp_path / "cache", Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))
     here.mkdir()
+    script = tmp_path / "small.py"
+    script.write_text(
+        "from shared.policies.furthest_points import _compiled\n@_compiled()\ndef f(x):\n    return x + 1\nf(1)\n"
+    )
     base = {name: value for name, value in os.environ.items() if name not in ("HOME", "XDG_CACHE_HOME")}
     base |= {"PYTHONPATH": str(Path(__file__).parents[2]), "TMPDIR": str(temporary)}
     for more in ({"XDG_CACHE_HOME": str(cache)}, {"HOME": "~"}):
         done = subprocess.run(
-            [sys.executable, "-c", script], env=base | more, cwd=here, capture_output=True, text=True, check=False
+            [sys.executable, str(script)], env=base | more, cwd=here, capture_output=True, text=True, check=False
         )
         assert (done.returncode, done.stderr) == (0, "")
     assert list(cache.rglob("*.nbi"))
     assert list(temporary.rglob("*.nbi"))
     assert list(here.iterdir()) == []
     shutil.rmtree(temporary)
+
+
+def test_all_that_is_compiled_is_kept_there() -> None:
+    compiled = [each for each in vars(module).values() if isinstance(each, Dispatcher)]
+    assert len(compiled) > 2
+    furthest_points(np.eye(3, dtype=np.float32), 2)
+    for each in compiled:
+        assert Path(each.stats.cache_path).is_relative_to(private.cache_folder("numba")), each

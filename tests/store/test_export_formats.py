@@ -449,7 +449,7 @@ def test_two_exports_into_one_folder_do_not_mix(store: Store, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("name", EXPORT_FORMATS.names())
-@pytest.mark.parametrize("step", [3, 9, 24])
+@pytest.mark.parametrize("step", [3, 24])
 def test_a_full_disk_ends_an_export_in_one_line_and_it_goes_on(
     name: str, step: int, store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

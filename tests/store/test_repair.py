@@ -105,7 +105,7 @@ def ruin_many(original: Path, folder: Path, cases: int, seed: int) -> None:
 
 
 def test_random_damage_is_found_and_repaired(original: Path, tmp_path: Path) -> None:
-    ruin_many(original, tmp_path, 20, seed=1)
+    ruin_many(original, tmp_path, 10, seed=1)
 
 
 @pytest.mark.slow

@@ -201,17 +201,19 @@ def test_a_machine_of_the_same_name_sweeps_nothing_that_may_be_alive(tmp_path: P
 AS_USERS = """
 import json, os, sys, tempfile, time
 from pathlib import Path
+import pyarrow, zarr.codecs, zarr.storage
 import cluster.cli.commands.upkeep, cluster.cli.commands.status
 import cluster.collection.status_writer, cluster.runs.status_snapshot
 from cluster.cli.main import run
 from shared.store import Store, verify, compact, repair
-from tests.store.test_several_users import PLAN, make
-from shared.plan import Job
+from shared.plan import Job, Plan
 from shared.store.crash_log import Heartbeat
-from tests.support.fabricate import fabricate_rollouts
+from tests.support.fabricate import fabricate_rollouts, fabricate_setting, fabricate_store
+
+PLAN = Plan(setting=fabricate_setting())
 
 def act(where, scratch, user, group, start):
-    warm = make(str(Path(tempfile.mkdtemp(dir=scratch)) / "warm"))   # What is imported late is imported now.
+    warm = fabricate_store(Path(tempfile.mkdtemp(dir=scratch)) / "warm", 2)   # What is imported late is imported now.
     verify(warm); compact(warm, 9); repair(warm.where); run(["status", warm.where])
     os.setgroups([]); os.setgid(group); os.setuid(user); os.umask(0o002)
     store = Store.create(where, PLAN.setting)
@@ -228,6 +230,7 @@ def act(where, scratch, user, group, start):
 
 where, scratch, acts = *sys.argv[1:3], json.loads(sys.argv[3])
 sys.stdout = sys.stderr
+pyarrow.array(["once"])  # With the first array, Arrow imports pandas, where that is installed; here, not in each child.
 ended = []
 for user, group, start in acts:
     # A process of its own for each, forked before any library has started a thread.

@@ -1,6 +1,7 @@
 """Processes that write a store at once, or are killed while they do; run as a script by tests.
 
-It forks before any library has started a thread, which a test process cannot promise.
+It forks before any library has started a thread, which a test process cannot promise. Only what starts none is done
+before: Arrow imports pandas, where that is installed, at the first array that it makes.
 """
 
 import os
@@ -9,6 +10,8 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+import pyarrow as pa
 
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord
@@ -121,6 +124,7 @@ def race(path: Path, writers: int) -> int:
 
 
 if __name__ == "__main__":
+    pa.array(["once, and not in each child"])
     if sys.argv[1] == "kill-in-place":
         print(kill_in_place(*sys.argv[2:]))
         sys.exit()

@@ -11,7 +11,8 @@ import tyro
 from pydantic import Field
 
 from cluster.config.flags import early_flags, layered, parse_flags
-from cluster.config.selection import ObjectSelection, RayAddress
+from cluster.config.selection import ObjectSelection
+from cluster.config.worker_settings import WorkerSettings
 from shared.config import CollectionConfig
 from shared.errors import UsageError
 from shared.plan import ROLLOUTS_PER_SHARD
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-class CollectSettings(ObjectSelection):
+class CollectSettings(WorkerSettings, ObjectSelection):
     """Settings of `adaafford collect` that a file may contain as well."""
 
     task: str = "push"
@@ -38,15 +39,6 @@ class CollectSettings(ObjectSelection):
     """Rollouts in each shard."""
     seed: int = Field(1, ge=0, lt=2**63)
     """All randomness is derived from it."""
-    workers: int = Field(2, ge=0, le=4096)
-    """Ray actors, one CPU each; 0: one process without Ray."""
-    ray_address: RayAddress | None = None
-    """HOST:PORT of a running Ray cluster, or auto; default: a private session on this machine."""
-    rollout_limit_s: float = Field(300.0, gt=0)
-    """A worker that takes longer for one rollout is replaced as hung; after three times the rollout is
-    quarantined."""
-    memory_limit_mb: float = Field(2000.0, gt=0)
-    """How much a worker's memory may grow after its start; at half of this it is replaced after its job."""
     procedural_per_category: int = Field(8, ge=1, le=10_000)
     """Built-in objects: how many of each category that the task applies to."""
     collection: CollectionConfig = CollectionConfig()
@@ -108,7 +100,6 @@ def run_collection(command: CollectCommand) -> None:
     from cluster.workers.session import worker_groups
     from cluster.workers.worker_group import make_worker
     from collector.setting import in_fidelity_of, make_setting, packages_used
-    from collector.watchdog import Limits
     from shared.plan import Plan
     from shared.store import Store
     from shared.store.backends.base import absolute, folder_beside
@@ -141,10 +132,9 @@ def run_collection(command: CollectCommand) -> None:
         plan = LatestPolicy(command.proposer, chosen.per_version)
     else:
         plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
-    limits = Limits(chosen.rollout_limit_s, chosen.memory_limit_mb)
     with (
         store.only_driver(alone=command.policy == "latest"),
-        worker_groups(chosen.workers, limits, chosen.ray_address) as make_worker_group,
+        worker_groups(chosen.workers, chosen.limits, chosen.ray_address) as make_worker_group,
     ):
         open_worker_group = partial(make_worker_group, partial(make_worker, where, folder), store.crash_log)
         collect(

@@ -16,12 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import zarr
 from numcodecs.blosc import Blosc  # type: ignore[import-untyped]
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec
-from zarr.core.buffer import Buffer
-from zarr.storage import MemoryStore
 
 from shared.depth import DepthMap, pack_steps, unpack_steps
 from shared.errors import StoreError
@@ -216,6 +212,12 @@ def pack(observation: Observation) -> Packed:
 
 def encode(observations: Sequence[Packed], points: int, pixels: int) -> dict[str, bytes]:
     """The files of the group, by path within it."""
+    # Imported here, since most processes only read, and this takes a quarter of a second.
+    import zarr
+    from zarr.codecs import BloscCodec
+    from zarr.core.buffer import Buffer
+    from zarr.storage import MemoryStore
+
     memory: dict[str, Buffer] = {}
     group = zarr.create_group(MemoryStore(memory), zarr_format=3)
     for kind in kinds(pixels):
