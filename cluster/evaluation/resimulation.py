@@ -93,7 +93,8 @@ def resimulate(
 def _chosen(store: Store, rows: int, seed: int) -> dict[str, list[tuple[int, int]]]:
     """Rollout and step of random labels, by shard."""
     table = store.interactions(["rollout", "step", "outcome"]).to_pylist()
-    labels = [row for row in table if OutcomeKind(row["outcome"]).is_label]
+    not_executed = (OutcomeKind.ABANDONED, OutcomeKind.UNREACHABLE)
+    labels = [row for row in table if row["outcome"] not in not_executed]
     if not labels:
         raise StoreError(f"{store.where}: holds no interaction that could be executed again")
     picked = generator(seed, "resimulate").choice(len(labels), min(rows, len(labels)), replace=False)

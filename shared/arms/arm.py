@@ -68,6 +68,11 @@ class Arm(StrictModel):
             raise ValueError(f"capsules are on links 0 to {len(self.joints)}")
         return self
 
+    @property
+    def limits(self) -> tuple[list[float], list[float]]:
+        """Lower and upper limits of the joints, rad or m."""
+        return [joint.lower for joint in self.joints], [joint.upper for joint in self.joints]
+
 
 ARMS = Registry("arm", Arm, {"panda": "shared.arms.built_in:PANDA", "ur5e": "shared.arms.built_in:UR5E"})
 """Arms by name: ours, and those of other packages."""

@@ -19,7 +19,7 @@ TOLERANCE_M, TOLERANCE_RAD = 2e-4, 2e-3
 MAX_JOINT_STEP = 0.35
 """rad or m, between two waypoints: more is a jump to another branch of solutions."""
 START_ITERATIONS, NEXT_ITERATIONS = 40, 12
-TABLE, SEEDS = 4096, 24
+TABLE, SEEDS = 4096, 16
 """Random joint positions whose hands are known; a search begins from those nearest to its start pose, one by one."""
 METRES_PER_RAD = 0.3
 """How far away a turned hand counts in that table."""
@@ -38,8 +38,7 @@ class Chain:
 
     def __init__(self, arm: Arm) -> None:
         self.arm = arm
-        self.lower = np.array([joint.lower for joint in arm.joints])
-        self.upper = np.array([joint.upper for joint in arm.joints])
+        self.lower, self.upper = map(np.array, arm.limits)
         self._slides = np.array([joint.kind == "prismatic" for joint in arm.joints])
         # Frames are turned so that each joint moves about or along its own z.
         turns = [np.eye(3), *(_z_to(np.array(joint.axis)) for joint in arm.joints)]
@@ -62,7 +61,7 @@ class Chain:
         self.radii = np.array([radius for _, _, radius in spheres])
         low, high = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
         self._known = np.random.default_rng(0).uniform(low, high, (TABLE, len(low)))
-        self._hands = self.hands(self._known)
+        self._features = _features(self.hands(self._known))
 
     def frames(self, positions: Float) -> Float:
         """The frames of the base, of each link and of the hand, [W, J + 2, 4, 4], at joint positions [W, J]."""
@@ -84,9 +83,7 @@ class Chain:
 
     def seeds(self, hand: Float) -> Float:
         """Joint positions, [SEEDS, J], whose hands are near to a pose [4, 4], the nearest first."""
-        away = np.linalg.norm(self._hands[:, :3, 3] - hand[:3, 3], axis=1)
-        cosine = (np.einsum("nij,ij->n", self._hands[:, :3, :3], hand[:3, :3]) - 1) / 2
-        away = away + METRES_PER_RAD * np.arccos(np.clip(cosine, -1.0, 1.0))
+        away = np.linalg.norm(self._features - _features(hand[None]), axis=1)
         return self._known[np.argsort(away, kind="stable")[:SEEDS]]
 
     def follow(self, hands: Float, seed: Float) -> Float | None:
@@ -113,6 +110,12 @@ def chain_of(arm: Arm) -> Chain:
 def _spheres_of(capsule: Capsule) -> int:
     """How many spheres stand for a capsule: one every radius, at most 64."""
     return min(int(np.ceil(np.linalg.norm(np.subtract(capsule.end, capsule.start)) / capsule.radius)) + 1, 64)
+
+
+def _features(hands: Float) -> Float:
+    """Poses [W, 4, 4] as [W, 12], so that their distance counts both place and rotation."""
+    turned = METRES_PER_RAD / np.sqrt(2) * hands[:, :3, :3].reshape(-1, 9)
+    return np.concatenate([hands[:, :3, 3], turned], axis=1)
 
 
 def _z_to(axis: Float) -> Float:

@@ -7,15 +7,19 @@ because it has to touch the object.
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from shared.arms.arm import Arm
 from shared.arms.kinematics import chain_of
+from shared.geometry import gripper_rotation
 from shared.primitives import START_DISTANCE, PrimitiveSpec
-from shared.types import Action, Float
+from shared.types import Action, Float, Observation
 
 WAYPOINT_M, WAYPOINT_RAD = 0.02, 0.1
 """The most that the hand moves and turns between two waypoints."""
+ASKED_POINTS = 64
+"""Of the movable points, for a heatmap."""
 
 
 def base_pose(x: float, y: float, z: float, yaw: float) -> Float:
@@ -42,11 +46,6 @@ class ArmReach:
         self._tree = cKDTree(local)
         self._legs = waypoints(primitive)
         self._found: dict[bytes, Float | None] = {}
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of a trajectory's columns."""
-        return tuple(joint.name for joint in self._chain.arm.joints)
 
     def hands(self, action: Action) -> Float:
         """Poses of the hand at the waypoints of an action, [W, 4, 4], in the frame of the base."""
@@ -81,6 +80,25 @@ class ArmReach:
         most = chain.radii.max(initial=0.0)
         nearest = np.asarray(self._tree.query(centres.reshape(-1, 3), distance_upper_bound=most)[0])
         return bool((nearest.reshape(centres.shape[:2]) >= chain.radii).all())
+
+
+def reachable_points(observation: Observation) -> NDArray[np.bool_]:
+    """Which movable points the arm of an observation reaches, straight against the surface, [N].
+
+    A few points are asked, spread over the cloud; the others are as the nearest of these.
+    """
+    assert observation.reach is not None, "the observation knows an arm"
+    asked = np.flatnonzero(observation.movable)[:ASKED_POINTS]
+    reached = []
+    for index in asked:
+        point, inward = observation.points[index].astype(np.float64), -observation.normals[index].astype(np.float64)
+        inward /= np.linalg.norm(inward)
+        aside, up = np.eye(3)[np.argsort(np.abs(inward))[:2]]
+        actions = (Action(int(index), point, gripper_rotation(inward, roll)) for roll in (aside, up))
+        reached.append(any(observation.reach.trajectory(action) is not None for action in actions))
+    nearest = np.asarray(cKDTree(observation.points[asked]).query(observation.points)[1])
+    found: NDArray[np.bool_] = np.array(reached)[nearest] & observation.movable
+    return found
 
 
 def waypoints(primitive: PrimitiveSpec) -> Float:
