@@ -36,6 +36,7 @@ from shared.store import Store
 from shared.store.codecs.columns import ROLLOUT_COLUMNS, RolloutRow
 from shared.store.codecs.digest import rollout_digest
 from shared.store.codecs.tables import read_table, table_bytes
+from shared.store.layout import ARM_VERSION
 from shared.tasks import task_named
 from shared.types import Action, HiddenDynamics, Observation, OutcomeKind
 from tests.adaafford.test_adapt_command import front
@@ -307,4 +308,5 @@ def test_a_worker_stores_where_the_arm_stood(objects: Path, tmp_path: Path) -> N
     Worker(tmp_path / "store", objects).run(plan, job)
     (record,) = store.read_rollouts(job.shard_id)
     assert len(record.arm_base) == 4
+    assert store.document.schema_version == ARM_VERSION == store.committed()[0].schema_version
     assert "unreachable" in {row.outcome.kind.value for row in record.interactions}
