@@ -61,6 +61,11 @@ class OutcomeKind(StrEnum):
         return self is not OutcomeKind.ABANDONED
 
     @property
+    def was_executed(self) -> bool:
+        """Whether the trial was simulated, so that it can be again."""
+        return self not in (OutcomeKind.ABANDONED, OutcomeKind.UNREACHABLE)
+
+    @property
     def is_valid(self) -> bool:
         """Whether the primitive ran to its end: what it closed its fingers on was held, and no contact was refused."""
         return self in (OutcomeKind.OK, OutcomeKind.NO_CONTACT)

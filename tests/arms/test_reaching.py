@@ -14,12 +14,14 @@ from cluster.cli.library import simulated
 from cluster.cli.main import run as adaafford
 from cluster.evaluation.rehearsal import Setting as Rehearsal
 from cluster.evaluation.rehearsal import SimulatedRobot
+from cluster.evaluation.resimulation import chosen_interactions, resimulate
 from collector.domain_randomisation import draw_arm_base
-from collector.objects.catalogue import scan
+from collector.objects.catalogue import load_ref, scan
 from collector.objects.procedural.writing import generate
 from collector.objects.surface import POINTS, surface_at
 from collector.setting import make_setting
 from collector.sim.armed import ArmedEnvironment
+from collector.sim.restoration import restored
 from collector.stopwatch import StageClock
 from collector.worker import Worker
 from shared.arms.arm import ARMS, URDF
@@ -299,7 +301,7 @@ def test_a_rehearsed_arm_answers_unreachable(objects: Path, tmp_path: Path) -> N
 def test_a_worker_stores_where_the_arm_stood(objects: Path, tmp_path: Path) -> None:
     camera = CameraConfig(image_size=64, points=64, candidates=200)
     collection = CollectionConfig(
-        arm="panda", camera=camera, fidelity=Fidelity(), rollout=RolloutConfig(interactions=4, continued=0)
+        arm="panda", camera=camera, fidelity=Fidelity(), rollout=RolloutConfig(interactions=8, continued=0)
     )
     refs = tuple(entry.ref for entry in scan(objects).usable)
     plan = Plan(setting=make_setting(task_named("push"), collection, seed=1, objects=refs))
@@ -309,4 +311,12 @@ def test_a_worker_stores_where_the_arm_stood(objects: Path, tmp_path: Path) -> N
     (record,) = store.read_rollouts(job.shard_id)
     assert len(record.arm_base) == 4
     assert store.document.schema_version == ARM_VERSION == store.committed()[0].schema_version
-    assert "unreachable" in {row.outcome.kind.value for row in record.interactions}
+    out = [row for row in record.interactions if row.outcome.kind is OutcomeKind.UNREACHABLE]
+    assert 0 < len(out) < len(record.interactions)
+    # Only what was executed is executed again.
+    again = resimulate(store, objects, rows=100, seed=1)
+    assert len(again.rows) == len(record.interactions) - len(out)
+    assert all(row.stored.kind is row.again.kind for row in again.rows)
+    assert len(chosen_interactions(store, rollout=0)[1]) == len(again.rows)
+    with pytest.raises(UsageError, match="the arm cannot reach it"):
+        restored(load_ref(objects, record.object), collection, record, out[0])
