@@ -11,10 +11,18 @@ from shared.errors import UsageError
 from shared.io.files import write_atomically
 from shared.types import Float, Float32
 
+Writer = Callable[[Float, Float32, NDArray[np.uint32], NDArray[np.bool_] | None], bytes]
+_OUT_OF_REACH = (120, 120, 120)
 _HEAT = ((30, 60, 140), (245, 245, 245), (200, 20, 30))
 
 
-def write_heatmap(path: Path, points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> None:
+def write_heatmap(
+    path: Path,
+    points: Float,
+    affordance: Float32,
+    indices: NDArray[np.uint32],
+    reachable: NDArray[np.bool_] | None = None,
+) -> None:
     """Write a heatmap in the format given by the suffix of the file.
 
     Args:
@@ -22,18 +30,20 @@ def write_heatmap(path: Path, points: Float, affordance: Float32, indices: NDArr
         points: [N, 3], in the scan's frame.
         affordance: [N], in [0, 1].
         indices: [N], which points of the scan these are.
+        reachable: [N], whether an arm reaches the point; grey where it does not, and a property or array `reachable`.
+            None: there is no arm.
 
     Raises:
         UsageError: the suffix is not allowed, or the folder cannot be written to.
     """
     writer = heatmap_writer(path)
     try:
-        write_atomically(path, writer(points, affordance, indices))
+        write_atomically(path, writer(points, affordance, indices, reachable))
     except OSError as error:
         raise UsageError(f"{path}: cannot be written ({error.strerror}); name another place") from None
 
 
-def heatmap_writer(path: Path) -> Callable[[Float, Float32, NDArray[np.uint32]], bytes]:
+def heatmap_writer(path: Path) -> Writer:
     """What makes the bytes of a heatmap of this name.
 
     Raises:
@@ -44,9 +54,12 @@ def heatmap_writer(path: Path) -> Callable[[Float, Float32, NDArray[np.uint32]],
     return _WRITERS[path.suffix.lower()]
 
 
-def colours(affordance: Float32) -> NDArray[np.uint8]:
-    """From dark blue (0) over white (0.5) to red (1), [N, 3]."""
-    return blended(_HEAT, affordance)
+def colours(affordance: Float32, reachable: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
+    """From dark blue (0) over white (0.5) to red (1), [N, 3]; grey where an arm does not reach."""
+    found = blended(_HEAT, affordance)
+    if reachable is not None:
+        found[~reachable] = _OUT_OF_REACH
+    return found
 
 
 def blended(stops: Sequence[Sequence[int]], shares: Float | Float32) -> NDArray[np.uint8]:
@@ -63,36 +76,46 @@ def blended(stops: Sequence[Sequence[int]], shares: Float | Float32) -> NDArray[
     return rounded
 
 
-def _ply(points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> bytes:
+def _ply(points: Float, affordance: Float32, indices: NDArray[np.uint32], reachable: NDArray[np.bool_] | None) -> bytes:
     fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    rows = np.zeros(len(points), dtype=[*fields, ("affordance", "<f4")])
+    fields += [("affordance", "<f4")] + ([] if reachable is None else [("reachable", "u1")])
+    rows = np.zeros(len(points), dtype=fields)
     for axis, name in enumerate("xyz"):
         rows[name] = points[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
-        rows[name] = colours(affordance)[:, channel]
+        rows[name] = colours(affordance, reachable)[:, channel]
     rows["affordance"] = affordance
+    if reachable is not None:
+        rows["reachable"] = reachable
     names = {"<f4": "float", "u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    header += [f"property {names[kind]} {name}" for name, kind in [*fields, ("affordance", "<f4")]]
+    header += [f"property {names[kind]} {name}" for name, kind in fields]
     return "\n".join([*header, "end_header\n"]).encode() + rows.tobytes()
 
 
-def _npz(points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> bytes:
+def _npz(points: Float, affordance: Float32, indices: NDArray[np.uint32], reachable: NDArray[np.bool_] | None) -> bytes:
     held = io.BytesIO()
-    np.savez_compressed(held, points=points, affordance=affordance, indices=indices)
+    arm = {} if reachable is None else {"reachable": reachable}
+    np.savez_compressed(held, allow_pickle=False, points=points, affordance=affordance, indices=indices, **arm)
     return held.getvalue()
 
 
-def _html(points: Float, affordance: Float32, indices: NDArray[np.uint32]) -> bytes:
+def _html(
+    points: Float, affordance: Float32, indices: NDArray[np.uint32], reachable: NDArray[np.bool_] | None
+) -> bytes:
     # Plotly takes a second to import and its page is some megabytes, so only where it is asked for.
     import plotly.graph_objects as go
 
     x, y, z = points.T
-    shown = [f"rgb({r},{g},{b})" for r, g, b in colours(affordance)]
+    shown = [f"rgb({r},{g},{b})" for r, g, b in colours(affordance, reachable)]
     marker = {"size": 3, "color": shown}
     texts = [f"{value:.2f}" for value in affordance]
     cloud = go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, text=texts, hoverinfo="text")
-    figure = go.Figure(cloud, {"scene": {"aspectmode": "data"}, "title": "affordance: blue 0, white 0.5, red 1"})
+    title = "affordance: blue 0, white 0.5, red 1" + ("" if reachable is None else "; grey: out of reach")
+    figure = go.Figure(
+        cloud,
+        {"scene": {"aspectmode": "data"}, "title": title},
+    )
     page: str = figure.to_html(include_plotlyjs=True, full_html=True)
     return page.encode()
 

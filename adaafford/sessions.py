@@ -8,7 +8,7 @@ import hashlib
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -29,15 +29,21 @@ from adaafford.scans import (
     read_scan_file,
 )
 from shared import seeds
+from shared.arms.arm import Arm
+from shared.arms.reach import ArmReach, reachable_points
 from shared.config import StrictModel
 from shared.errors import UsageError
 from shared.io.text import plain
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
 from shared.policies.proposers import AipProposer, ExploitProposer
-from shared.types import Observation
+from shared.primitives import PRIMITIVES
+from shared.tasks import task_named
+from shared.types import Action, Observation
 
 PURPOSE = "adapt"
+SURFACE_POINTS = 10_000
+"""Of a scan, about, that the links of an arm must not touch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +70,15 @@ class Seconds(StrictModel):
     """The heatmap and the history."""
 
 
+class Trajectory(StrictModel):
+    """What an arm's controller executes: the whole primitive, from the start pose of the hand on."""
+
+    joints: tuple[str, ...]
+    """Their names."""
+    waypoints: tuple[tuple[float, ...], ...]
+    """[W, J], rad or m; straight in between, at most 2 cm of the hand apart."""
+
+
 class Step(StrictModel):
     """The answer of a session, in the frame of the scan."""
 
@@ -79,6 +94,8 @@ class Step(StrictModel):
     forward: Vector
     belief: float
     """The predicted success probability of the action."""
+    trajectory: Trajectory | None = Field(None, exclude_if=lambda trajectory: trajectory is None)
+    """Of the arm, if one was named."""
     seconds: float
     """Duration of the step."""
 
@@ -137,6 +154,9 @@ class Session:
         camera: camera position, in the same frame; default: that of the first scan, otherwise 0 0 0.
         points: how many points of a scan the policy receives.
         tell: receives warnings about a scan or its frame.
+        arm: that executes the actions; only what it reaches is proposed. None: anything is.
+        base: x, y, z and yaw of its base, in the frame of the scans: m, and rad about `up` from x (from y where up is
+            x). The floor is as low as the base, or as the lowest point of the scan.
     """
 
     def __init__(
@@ -149,6 +169,8 @@ class Session:
         camera: Vector | None = None,
         points: int = POINTS,
         tell: Callable[[str], object] = lambda line: None,
+        arm: Arm | None = None,
+        base: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
     ) -> None:
         policy.require("prior", "aap", "aip")
         if files.heatmap is not None:
@@ -156,6 +178,8 @@ class Session:
         self._adapter = Adapter(policy)
         self._files, self._budget, self._seed, self._points = files, budget, seed, points
         self._up, self._camera, self._tell = up, camera, tell
+        self._arm, self._base = arm, base
+        self._primitive = None if arm is None else PRIMITIVES.get(task_named(policy.task).primitive)
         self._observations: dict[tuple[str, ScanFrame], Observation] = {}
         self._steps = self._tries = 0
         self._seconds: Seconds | None = None
@@ -195,12 +219,14 @@ class Session:
         if action is None:
             action = ExploitProposer(self._adapter, rng).propose(observation, known)
             assert action is not None, "an exploiter never stops"
+        trajectory = self._trajectory(observation, action, cloud)
         belief = float(self._adapter.score(observation, [action], known)[0])
         heat = None if self._files.heatmap is None else self._adapter.affordance(observation, known)
         chosen = time.perf_counter()
         if self._files.heatmap is not None and heat is not None:
             places = history.frame.point_to_scan(observation.points.astype(np.float64))
-            write_heatmap(self._files.heatmap, places, heat, observation.pixels)
+            reachable = None if observation.reach is None else reachable_points(observation)
+            write_heatmap(self._files.heatmap, places, heat, observation.pixels, reachable)
         history = history.proposing(action, name, sha256)
         write_history(self._files.history, history)
         proposed, ended = history.interactions[-1], time.perf_counter()
@@ -216,7 +242,28 @@ class Session:
             approach=proposed.approach,
             forward=proposed.forward,
             belief=round(belief, 4),
+            trajectory=trajectory,
             seconds=round(ended - begun, 3),
+        )
+
+    def _trajectory(self, observation: Observation, action: Action, cloud: Path) -> Trajectory | None:
+        """How the arm executes an action.
+
+        Raises:
+            UsageError: it reaches neither this nor any other action that was looked at.
+        """
+        if self._arm is None or observation.reach is None:
+            return None
+        path = observation.reach.trajectory(action)
+        if path is None:
+            base = " ".join(f"{number:g}" for number in self._base)
+            raise UsageError(
+                f"{cloud}: the arm with its base at {base} reaches none of the actions that the policy proposes; move "
+                "the base or the object, or correct --base"
+            )
+        return Trajectory(
+            joints=tuple(joint.name for joint in self._arm.joints),
+            waypoints=tuple(map(tuple, path.round(5).clip(*self._arm.limits).tolist())),
         )
 
     def _is_told(self, history: History, outcome: TriedOutcome, interaction: int | None, cloud: str) -> bool:
@@ -299,4 +346,10 @@ class Session:
     def _remember(self, scan: Scan, path: Path, sha256: str, frame: ScanFrame) -> None:
         if missing := missing_points(scan):
             self._tell(f"{path}: {missing}")
-        self._observations[sha256, frame] = observation_of(scan, frame, self._seed, self._points)
+        observation = observation_of(scan, frame, self._seed, self._points)
+        if self._arm is not None and self._primitive is not None:
+            x, y, z = frame.to_world([self._base[:3]])[0]
+            surface = frame.to_world(scan.points[:: 1 + len(scan.points) // SURFACE_POINTS])
+            reach = ArmReach(self._arm, (x, y, z, self._base[3]), self._primitive, surface)
+            observation = replace(observation, reach=reach)
+        self._observations[sha256, frame] = observation

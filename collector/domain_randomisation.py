@@ -8,12 +8,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from collector.objects.articulation import ArticulatedObject
+from collector.objects.surface import surface_at
 from shared import seeds
 from shared.config import DynamicsRanges, Range
 from shared.hidden import ALWAYS_DRAWN
 from shared.plan import ObjectRef, Plan
 from shared.tasks import Task
 from shared.types import HiddenDynamics
+
+ARM_DISTANCE, ARM_ASIDE, ARM_TURN = (0.3, 0.6), 0.3, 0.2
+"""Of the base of an arm: how far before the object's front, and aside of its middle, m, and turned off it, rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +65,22 @@ def draw_dynamics(ranges: DynamicsRanges, task: Task, rng: np.random.Generator) 
     """The hidden parameters that are always drawn, within `ranges`, with one of the task's direction modes."""
     values = {name: draw_range(ranges[name], rng) for name in ALWAYS_DRAWN}
     return HiddenDynamics(values, task.directions[int(rng.integers(len(task.directions)))])
+
+
+def draw_arm_base(plan: Plan, index: int, target: ArticulatedObject) -> tuple[float, ...]:
+    """Where the base of the arm stands in a rollout: x, y, z and yaw, world frame; empty without an arm.
+
+    It is in front of the object (objects face -x), turned to it, on the floor that the object stands on.
+    """
+    if plan.setting.collection.arm is None:
+        return ()
+    rng = seeds.generator(plan.setting.seed, f"arm/{plan.key}", index)
+    surface = surface_at(target, target.limits()[:, 0])
+    low, high = surface.min(axis=0), surface.max(axis=0)
+    middle = (low + high) / 2
+    x, y = low[0] - rng.uniform(*ARM_DISTANCE), middle[1] + rng.uniform(-ARM_ASIDE, ARM_ASIDE)
+    yaw = np.arctan2(middle[1] - y, middle[0] - x) + rng.uniform(-ARM_TURN, ARM_TURN)
+    return float(x), float(y), float(low[2]), float(yaw)
 
 
 def draw_range(interval: Range, rng: np.random.Generator) -> float:

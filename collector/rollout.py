@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from collector.domain_randomisation import Draw, draw_rollout
+from collector.domain_randomisation import Draw, draw_arm_base, draw_rollout
 from collector.evaluation_rollout import ProposerFactory, evaluate
 from collector.objects.articulation import ArticulatedObject
 from collector.random_proposer import RandomProposer
 from collector.recorder import Recorder
+from collector.sim.armed import ArmedEnvironment
 from collector.sim.simulator import SIMULATORS, SimEnvironment
 from collector.stopwatch import StageClock
 from shared import seeds
@@ -33,15 +34,15 @@ def run_rollout(
         make_proposer: makes the proposers of the plan.
         clock: sums wall time by stage.
     """
-    start = begin(plan, index, target, clock)
+    start, base = begin(plan, index, target, clock), draw_arm_base(plan, index, target)
     if isinstance(start, RolloutStatus):
-        return _record(plan, draw_rollout(plan, index, TRIES - 1), start, None)
+        return _record(plan, draw_rollout(plan, index, TRIES - 1), start, None, base)
     recorder = Recorder(start.environment, plan.policy_version, clock)
     if plan.setting.kind == "evaluation":
         evaluate(plan, index, recorder, make_proposer)
     else:
         collect(plan, index, recorder, start.states, make_proposer)
-    return _record(plan, start.draw, RolloutStatus.OK, recorder)
+    return _record(plan, start.draw, RolloutStatus.OK, recorder, base)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +95,9 @@ def quarantined_rollout(plan: Plan, index: int) -> RolloutRecord:
 def make_environment(
     plan: Plan, draw: Draw, target: ArticulatedObject, clock: StageClock, attempt: int = 0
 ) -> SimEnvironment:
-    """The simulated environment of one rollout."""
+    """The simulated environment of one rollout, behind its arm if there is one."""
     setting = plan.setting
-    return SIMULATORS.get(setting.collection.simulator).make(
+    environment = SIMULATORS.get(setting.collection.simulator).make(
         target,
         setting.task_record,
         setting.collection,
@@ -105,6 +106,8 @@ def make_environment(
         seeds.generator(setting.seed, f"pixels/{plan.key}", draw.index, attempt),
         clock,
     )
+    arm, base = setting.arm, draw_arm_base(plan, draw.index, target)
+    return environment if arm is None else ArmedEnvironment(environment, arm, base, setting.collection.arm_known, clock)
 
 
 def collect(
@@ -143,7 +146,9 @@ def _next_state(environment: SimEnvironment, states: np.random.Generator) -> boo
     return any(environment.reset(states) and environment.shows_a_target() for _ in range(TRIES))
 
 
-def _record(plan: Plan, draw: Draw, status: RolloutStatus, recorder: Recorder | None) -> RolloutRecord:
+def _record(
+    plan: Plan, draw: Draw, status: RolloutStatus, recorder: Recorder | None, arm_base: tuple[float, ...] = ()
+) -> RolloutRecord:
     return RolloutRecord(
         index=draw.index,
         plan_key=plan.key,
@@ -156,4 +161,5 @@ def _record(plan: Plan, draw: Draw, status: RolloutStatus, recorder: Recorder | 
         status=status,
         observations=tuple(recorder.observations) if recorder else (),
         interactions=tuple(recorder.interactions) if recorder else (),
+        arm_base=arm_base,
     )

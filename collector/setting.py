@@ -5,6 +5,7 @@ from typing import Any
 
 from collector.sim.grippers import GRIPPERS
 from collector.sim.simulator import SIMULATORS
+from shared.arms.arm import ARMS, URDF, arm_of
 from shared.config import FIDELITIES, CollectionConfig, Fidelity
 from shared.errors import UsageError
 from shared.extensions import added_by_packages
@@ -29,10 +30,13 @@ def make_setting(
     Raises:
         UsageError: nothing is called as the setting says.
     """
+    from_file = collection.arm is not None and collection.arm not in ARMS.names()
     return Setting(
         task=task.name,
         task_definition=None if task.name in TASKS.names() else task,
-        collection=task.resolve(collection),
+        arm_definition=arm_of(str(collection.arm)) if from_file else None,
+        # Where the file lies says something about this machine.
+        collection=task.resolve(collection.model_copy(update={"arm": URDF}) if from_file else collection),
         evaluation=evaluation,
         extensions=packages_used(task, collection, evaluation),
         **rest,
@@ -53,6 +57,7 @@ def packages_used(
             (PRIMITIVES, terms.primitive),
             (GRIPPERS, collection.gripper),
             (SIMULATORS, collection.simulator),
+            *([(ARMS, collection.arm)] if collection.arm in ARMS.names() else []),
             *terms.dynamics.extensions,
             *found_by_name(task, evaluation),
         ]

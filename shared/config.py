@@ -244,6 +244,11 @@ class CollectionConfig(StrictModel):
     """Instead of the task's own: push, push-left, push-up, pull, pull-left, pull-up, or what a package adds."""
     gripper: Name = Field(PANDA, exclude_if=lambda name: name == PANDA)
     """The hand: panda, or what a package adds. Documents leave out the default, which they did not know once."""
+    arm: str | None = Field(None, max_length=1000, exclude_if=lambda arm: arm is None)
+    """The arm that carries the hand: panda, ur5e, what a package adds, or FILE.urdf, or FILE.urdf#LINK where LINK
+    carries the hand. What it cannot reach is not executed (`unreachable`). None: the hand flies."""
+    arm_known: bool = Field(True, exclude_if=lambda known: known)
+    """Whether policies know the arm, so that they propose what it reaches; random interactions never do."""
     simulator: Name = Field(SAPIEN, exclude_if=lambda name: name == SAPIEN)
     """What rollouts are simulated with: sapien, or what a package adds; left out likewise."""
     camera: CameraConfig = CameraConfig()

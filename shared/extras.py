@@ -7,6 +7,7 @@ from shared.errors import UsageError
 
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
+    "arm": ("defusedxml",),
     "report": ("matplotlib", "plotly", "jinja2"),
     "video": ("av",),
     "view": ("viser", "websockets"),

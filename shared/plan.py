@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import FailFast, Field, model_validator
 
+from shared.arms.arm import ARMS, Arm
 from shared.config import CollectionConfig, DynamicsRanges, StrictModel
 from shared.extensions import Registry
 from shared.policies.methods import BASELINES, METHODS, PROPOSERS, RANDOM, MethodName
@@ -60,6 +61,8 @@ class Setting(StrictModel):
     task: str
     task_definition: Task | None = Field(None, exclude_if=lambda task: task is None)
     """The task itself where a file defined it, so that a store says all that was decided; None: found by its name."""
+    arm_definition: Arm | None = Field(None, exclude_if=lambda arm: arm is None)
+    """The arm itself where a file defined it, likewise."""
     seed: int = Field(ge=0)
     objects: Annotated[tuple[ObjectRef, ...], FailFast(), Field(min_length=1)]
     collection: CollectionConfig
@@ -82,6 +85,16 @@ class Setting(StrictModel):
             UsageError: there is no such task; the package that adds it may not be installed.
         """
         return self.task_definition or task_named(self.task)
+
+    @property
+    def arm(self) -> Arm | None:
+        """The arm that carries the hand; None: the hand flies.
+
+        Raises:
+            UsageError: there is no such arm; the package that adds it may not be installed.
+        """
+        name = self.collection.arm
+        return self.arm_definition or (None if name is None else ARMS.get(name))
 
     @property
     def identities(self) -> frozenset[tuple[str, str, str]]:

@@ -87,6 +87,7 @@ class RolloutRecord:
         status: whether it was executed; there are neither observations nor interactions if not.
         observations: each one once, for any number of actions.
         interactions: in the order they were executed.
+        arm_base: [4], x, y, z and yaw, world frame, of the base of the arm; empty: the hand flies.
     """
 
     index: int
@@ -100,3 +101,4 @@ class RolloutRecord:
     status: RolloutStatus
     observations: tuple[Observation, ...]
     interactions: tuple[InteractionRecord, ...]
+    arm_base: tuple[float, ...] = ()

@@ -48,6 +48,8 @@ class OutcomeKind(StrEnum):
     """Under the first-contact rule: the palm touched anything before or at the first contact."""
     UNSTABLE = "unstable"
     """The simulation diverged (not a number, or a joint far outside its limits)."""
+    UNREACHABLE = "unreachable"
+    """The arm cannot carry the hand along the primitive, so nothing was executed."""
     UNKNOWN = "unknown"
     """Nobody said how it ended, as a robot's history may leave it; no simulator gives this."""
     ABANDONED = "abandoned"
@@ -57,6 +59,11 @@ class OutcomeKind(StrEnum):
     def is_label(self) -> bool:
         """Whether a learner may use the row."""
         return self is not OutcomeKind.ABANDONED
+
+    @property
+    def was_executed(self) -> bool:
+        """Whether the trial was simulated, so that it can be again."""
+        return self not in (OutcomeKind.ABANDONED, OutcomeKind.UNREACHABLE)
 
     @property
     def is_valid(self) -> bool:
@@ -142,6 +149,14 @@ class DenseGeometry(Protocol):
         ...
 
 
+class Reach(Protocol):
+    """What the arm in front of an object can do."""
+
+    def trajectory(self, action: "Action") -> Float | None:
+        """Joint positions, [W, J], rad or m, that execute an action; None if there are none."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Observation:
     """A partial cloud of one object from one camera, in furthest-point order: any prefix covers the object.
@@ -163,6 +178,8 @@ class Observation:
     """[4, 4], rigid."""
     dense: DenseGeometry | None = None
     """The whole of what the sensor measured, where it was kept: `collection.camera.keep_depth`, or a robot's scan."""
+    reach: Reach | None = None
+    """The arm that will execute the action, where the proposer is to know it; it then proposes what the arm reaches."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,11 @@ from pathlib import Path
 from cluster.config.campaign_config import SplitConfig
 from cluster.config.selection import ObjectSelection
 from collector.objects.catalogue import Catalogue, ObjectSplit, for_task, of_categories, read_list, scan, split
-from collector.objects.files import short
 from collector.objects.procedural.catalogue import CATEGORIES, categories_of
 from collector.objects.procedural.writing import generate
 from shared.categories import expanded
 from shared.errors import UsageError
+from shared.io.text import short
 from shared.plan import ObjectRef
 from shared.tasks import Task
 

@@ -17,6 +17,7 @@ from pydantic import Field
 from adaafford.histories import TriedOutcome, parse_json
 from adaafford.scans import Scan, ScanFrame, action_at, npz_of
 from adaafford.sessions import Request, Session, Step
+from collector.sim.armed import ArmedEnvironment
 from collector.sim.depth_noise import noisy
 from collector.sim.environment import camera_for
 from collector.sim.simulator import SimEnvironment
@@ -29,7 +30,7 @@ from shared.types import Outcome, OutcomeKind
 STATE = "rehearsal.json"
 MAX_STATE_BYTES = 1 << 20
 BASE = (1.2, 0.0, 0.6)
-"""Where the object's origin is in the frame of the robot's base, m; z is up, and the object faces the base."""
+"""Where the object's origin is in the frame of the scans without an arm, m; z is up, and the object faces -x."""
 PURPOSE = "depth noise"
 
 
@@ -43,6 +44,7 @@ class Setting(StrictModel):
         number: which of the objects that this seed gives, from 0.
         noise: see `collector.sim.depth_noise`.
         marked: whether scans say which points the policy may act on.
+        arm: name or file of the arm; None: the hand flies.
     """
 
     task: str
@@ -51,6 +53,7 @@ class Setting(StrictModel):
     number: int
     noise: float
     marked: bool
+    arm: str | None = Field(None, exclude_if=lambda arm: arm is None)
 
 
 class Executed(StrictModel):
@@ -88,6 +91,7 @@ class SimulatedRobot:
 
     Attributes:
         folder: the same.
+        base: x, y, z and yaw of the arm's base in the frame of the scans; None: the hand flies.
 
     Raises:
         UsageError: the folder has the state of another rehearsal, or a file that is none.
@@ -96,6 +100,11 @@ class SimulatedRobot:
     def __init__(self, environment: SimEnvironment, setting: Setting, folder: Path) -> None:
         self._environment, self.folder = environment, folder
         self._config = CameraConfig()
+        self.base: tuple[float, float, float, float] | None = None
+        self._origin = BASE
+        if isinstance(environment, ArmedEnvironment):
+            x, y, z, yaw = environment.base
+            self._origin, self.base = (-x, -y, -z), (0.0, 0.0, 0.0, yaw)
         observed = environment.observe()
         self._pose = observed.world_from_camera
         self._parts = np.unique(observed.part_ids[observed.movable])
@@ -155,7 +164,7 @@ class SimulatedRobot:
     def _try(self, step: Step) -> TriedOutcome:
         """Execute an action that was chosen on a noisy scan, at the nearest point that is seen."""
         observed = self._environment.observe()
-        frame = ScanFrame(camera=(0.0, 0.0, 0.0), origin=BASE)
+        frame = ScanFrame(camera=(0.0, 0.0, 0.0), origin=self._origin)
         try:
             action = action_at(observed, frame, step.point, step.approach, step.forward)
         except UsageError:
@@ -179,9 +188,9 @@ class SimulatedRobot:
         image = noisy(
             camera.capture(self._environment.state()), self._config.image_size, place, self._state.setting.noise, rng
         )
-        x, y, z = (place + BASE).tolist()
+        x, y, z = (place + self._origin).tolist()
         scan = Scan(
-            (image.points + BASE).astype(np.float32).astype(np.float64),
+            (image.points + self._origin).astype(np.float32).astype(np.float64),
             movable=np.isin(image.bodies, self._parts) if self._state.setting.marked else None,
             camera=(x, y, z),
         )

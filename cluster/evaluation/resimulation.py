@@ -93,7 +93,7 @@ def resimulate(
 def _chosen(store: Store, rows: int, seed: int) -> dict[str, list[tuple[int, int]]]:
     """Rollout and step of random labels, by shard."""
     table = store.interactions(["rollout", "step", "outcome"]).to_pylist()
-    labels = [row for row in table if OutcomeKind(row["outcome"]).is_label]
+    labels = [row for row in table if OutcomeKind(row["outcome"]).was_executed]
     if not labels:
         raise StoreError(f"{store.where}: holds no interaction that could be executed again")
     picked = generator(seed, "resimulate").choice(len(labels), min(rows, len(labels)), replace=False)
@@ -122,7 +122,7 @@ def chosen_interactions(
     wanted = {"rollout": rollout, "step": step, "success": success}
     where = [(name, "=", value) for name, value in wanted.items() if value is not None]
     table = store.interactions(["rollout", "step", "success", "outcome"], where=where).to_pylist()
-    found = [row for row in table if OutcomeKind(row["outcome"]).is_label and shard in ("", row["shard"])]
+    found = [row for row in table if OutcomeKind(row["outcome"]).was_executed and shard in ("", row["shard"])]
     if not found:
         chosen = [f"{name} {value}" for name, value in wanted.items() if value is not None]
         chosen += [f"shard {shard}"] if shard else []
@@ -136,7 +136,7 @@ def chosen_interactions(
     first = found[0]
     record = next(each for each in store.read_rollouts(first["shard"]) if each.index == first["rollout"])
     if rollout is not None and step is None and success is None:
-        return record, tuple(row for row in record.interactions if row.outcome.kind.is_label)
+        return record, tuple(row for row in record.interactions if row.outcome.kind.was_executed)
     return record, tuple(row for row in record.interactions if row.step == first["step"])
 
 

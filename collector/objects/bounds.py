@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from collector.objects.articulation import Body, Joint
-from collector.objects.files import short
 from shared.errors import ObjectError
+from shared.io.text import short
 
 MAX_PARTS = 150
 """Published objects have fewer. The engine loses joints beyond 254, and time grows with the square of their number."""

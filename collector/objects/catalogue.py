@@ -13,13 +13,14 @@ import numpy as np
 
 from collector.objects.articulation import MIN_RANGE, ArticulatedObject, PartSummary
 from collector.objects.decomposition import Decomposer
-from collector.objects.files import ObjectFiles, short
+from collector.objects.files import ObjectFiles
 from collector.objects.readers import READERS, read_files, read_object, reader_of
 from collector.objects.scan_cache import Found, ScanCache
 from shared.config import Collision
 from shared.errors import ObjectError, UsageError
 from shared.io.files import read_named
 from shared.io.private import cache_folder
+from shared.io.text import short
 from shared.plan import ObjectRef
 from shared.seeds import generator
 from shared.tasks import Task

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from shared.errors import ObjectError
+from shared.io.text import short
 
 _GITFILE = b"gitdir: "
 _MOST_GITFILE = 4096
@@ -18,12 +19,6 @@ _POINTERS = (
     (re.compile(rb"version https://git-lfs\.github\.com/spec/"), "Git LFS", "git lfs pull"),
     (re.compile(rb"(?:[./]*\.git\S*)?/annex/objects/"), "git-annex", "git annex get"),
 )
-
-
-def short(text: object, length: int = 80) -> str:
-    """`text` for a one-line message: quoted, without control characters, shortened."""
-    quoted = repr(str(text)[: length + 1])
-    return quoted if len(quoted) <= length + 2 else quoted[:length] + "...'"
 
 
 def add_framed(digest: Any, *parts: bytes) -> None:

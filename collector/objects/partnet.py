@@ -13,11 +13,12 @@ from urllib.parse import unquote
 
 from pydantic_core import from_json
 
-from collector.objects.files import ObjectFiles, add_framed, short
+from collector.objects.files import ObjectFiles, add_framed
 from collector.objects.readers import MAX_WORD, Description
-from collector.objects.urdf import MAX_URDF_BYTES, parse_urdf
 from collector.objects.urdf_bodies import UrdfBodies, UrdfMeshes, joint_notes, listed
 from shared.errors import ObjectError
+from shared.io.text import short
+from shared.urdf import MAX_URDF_BYTES, parse_urdf
 
 MAX_TEXT_BYTES = 1 << 20
 URDF_FILES = ("mobility.urdf", "mobility_vhacd.urdf", "mobility_cvx.urdf")

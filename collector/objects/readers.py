@@ -15,9 +15,10 @@ from pydantic import ValidationError
 
 from collector.objects.articulation import MIN_RANGE, ArticulatedObject, Body, Joint
 from collector.objects.bounds import check_bounds
-from collector.objects.files import ObjectFiles, short
+from collector.objects.files import ObjectFiles
 from shared.errors import ObjectError
 from shared.extensions import Registry
+from shared.io.text import short
 from shared.plan import ObjectRef
 
 MAX_WORD = 64

@@ -8,11 +8,11 @@ import numpy as np
 
 from collector.objects import meshes
 from collector.objects.articulation import MIN_RANGE, Body, Joint, Mesh
-from collector.objects.files import short
 from collector.objects.readers import alike
-from collector.objects.urdf import Shape, Urdf, UrdfJoint
 from shared.errors import ObjectError
+from shared.io.text import short
 from shared.types import Float
+from shared.urdf import Shape, Urdf, UrdfJoint
 
 MAX_OBJECT_BYTES = 256 << 20
 MAX_OBJECT_VERTICES = 5_000_000

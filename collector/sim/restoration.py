@@ -8,7 +8,7 @@ from shared.config import SAPIEN, CollectionConfig
 from shared.errors import UsageError
 from shared.primitives import PRIMITIVES
 from shared.records import InteractionRecord, RolloutRecord
-from shared.types import Direction, Float
+from shared.types import Direction, Float, OutcomeKind
 
 
 def restored(
@@ -23,9 +23,11 @@ def restored(
         row: one of its interactions.
 
     Raises:
-        UsageError: another simulator made the store.
+        UsageError: another simulator made the store, or the arm did not reach the action.
     """
     refuse_other_simulators(collection)
+    if row.outcome.kind is OutcomeKind.UNREACHABLE:
+        raise UsageError(f"interaction {row.step} was not executed, because the arm cannot reach it; choose another")
     primitive = PRIMITIVES.get(row.primitive)
     scene = Scene(target, rollout.dynamics, collection.fidelity, primitive, collection.gripper)
     if rollout.dynamics.direction is not Direction.AS_BUILT:

@@ -28,6 +28,12 @@ def plain(text: object, most: int | None = None) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in shown)[:most]
 
 
+def short(text: object, length: int = 80) -> str:
+    """`text` for a one-line message: quoted, without control characters, shortened."""
+    quoted = repr(str(text)[: length + 1])
+    return quoted if len(quoted) <= length + 2 else quoted[:length] + "...'"
+
+
 def markdown(text: object) -> str:
     """The same within Markdown, where it is neither a mark, nor HTML, nor the end of a table's cell."""
     return html.escape(_MARKS.sub(r"\\\g<0>", plain(text)), quote=False)

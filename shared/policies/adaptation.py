@@ -7,7 +7,7 @@ Shapes: N points of a cloud, A actions, S proposals at a point.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -328,6 +328,48 @@ def frames_in_view(observation: Observation, actions: Sequence[Action]) -> Tenso
     view = view_from_world(observation.world_from_camera)
     rows = [np.concatenate([view @ action.approach, view @ action.forward]) for action in actions]
     return torch.from_numpy(np.array(rows, dtype=np.float32).reshape(-1, 6))
+
+
+MOST_POINTS, NEAR_M = 16, 0.05
+"""Points at which an action within the arm's reach is looked for, and how far apart they are, m."""
+
+
+def reachable_action(
+    observation: Observation,
+    points: NDArray[np.int64],
+    choose: Callable[[NDArray[np.int64]], int],
+    act: Callable[[int], tuple[Proposals, Tensor]],
+) -> Action:
+    """The best action at a point; where the arm is known, the best that it reaches, at the next point if need be.
+
+    Args:
+        observation: with or without an arm.
+        points: indices of the points that may be chosen, [C].
+        choose: chooses the best of those at some places in `points`, [1 or more]; returns the place in `points`.
+        act: gives proposals at a point, and their scores, [S].
+
+    Returns:
+        If the arm reaches none: the best action at the first point, whose trajectory is then None.
+    """
+    places: Float = observation.points[points].astype(np.float64)
+    left, best = np.arange(len(points)), None
+    for _ in range(MOST_POINTS):
+        chosen = choose(left)
+        point = int(points[chosen])
+        proposals, scores = act(point)
+        if best is None:
+            best = action_from_frame(observation, point, proposals.frames[int(scores.argmax())])
+        if observation.reach is None:
+            return best
+        for place in scores.argsort(descending=True, stable=True):
+            action = action_from_frame(observation, point, proposals.frames[place])
+            if observation.reach.trajectory(action) is not None:
+                return action
+        left = left[np.linalg.norm(places[left] - places[chosen], axis=1) > NEAR_M]
+        if not len(left):
+            break
+    assert best is not None, "there is a first point"
+    return best
 
 
 def action_from_frame(observation: Observation, point: int, frame: Tensor) -> Action:

@@ -3,7 +3,7 @@
 Shapes: N points of a cloud, A actions, S proposals at a point, K interactions, Q queried points.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from shared.errors import UsageError
-from shared.policies.adaptation import Adapter, Proposals, action_from_frame
+from shared.policies.adaptation import Adapter, Proposals, reachable_action
 from shared.policies.methods import BASELINES, CriticName, ModuleName
 from shared.types import Action, Float32, Interaction, Observation
 
@@ -63,14 +63,18 @@ def best_action(
     critic: Critic,
     adapter: Adapter,
     observation: Observation,
-    point: int,
+    points: NDArray[np.int64],
+    choose: Callable[[NDArray[np.int64]], int],
     history: Sequence[Interaction],
     rng: np.random.Generator,
 ) -> Action:
-    """The best by a critic of 100 rotations at a point, from the prior's proposal network."""
-    proposals = adapter.proposals(observation, point, rng)
-    best = int(critic.predict_proposals(observation, proposals, history).argmax())
-    return action_from_frame(observation, point, proposals.frames[best])
+    """The best by a critic of 100 rotations at a point, from the prior's proposal network; see `reachable_action`."""
+
+    def act(point: int) -> tuple[Proposals, Tensor]:
+        proposals = adapter.proposals(observation, point, rng)
+        return proposals, critic.predict_proposals(observation, proposals, history)
+
+    return reachable_action(observation, points, choose, act)
 
 
 class Where2ActCritic:

@@ -49,8 +49,11 @@ class FpsProposer(ABC):
         actionability = self.critic.affordance(observation, candidates, history)
         tried = np.array([interaction.action.point for interaction in history]).reshape(-1, 3)
         spread = distances_to(observation.points[candidates].astype(np.float64), tried)
-        point = int(candidates[self.choose(spread, actionability)])
-        return best_action(self.critic, self.adapter, observation, point, history, self.rng)
+
+        def choose(left: NDArray[np.int64]) -> int:
+            return int(left[self.choose(None if spread is None else spread[left], actionability[left])])
+
+        return best_action(self.critic, self.adapter, observation, candidates, choose, history, self.rng)
 
     @abstractmethod
     def choose(self, spread: Float | None, actionability: Float32) -> int:

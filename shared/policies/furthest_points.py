@@ -6,27 +6,20 @@ several points that are equally far, the one that comes first in the tree is tak
 `bucket_fps_kdline_sampling` of the package fpsample, which has no wheels for Python 3.13 and later. So stores that were
 made with that package keep their digests.
 
-Numba compiles this module at its first call and keeps the machine code in the user's cache folder.
 Sums of floating-point numbers are neither reordered nor fused, so the result does not depend on the processor.
 
 Shapes: N points, L leaves, K samples.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-from numba import config, njit
 from numpy.typing import NDArray
 
-from shared.errors import UsageError
-from shared.io.private import cache_folder
+from shared.compilation import compiled
 from shared.types import Float32
 
 TREE_HEIGHT = 5
 """The leaves are 2 to the power of this. It decides which of equally far points is taken, so it is part of the data."""
 
-_SETTINGS: Any = config
 _FURTHEST = np.float32(np.finfo(np.float32).max)
 
 
@@ -44,25 +37,7 @@ def furthest_points(points: Float32, count: int) -> NDArray[np.int64]:
     return chosen
 
 
-def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile a function at its first call; keep the machine code where that is possible."""
-
-    def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-        before = _SETTINGS.CACHE_DIR
-        try:
-            # Without a home, Numba's own choice would be a folder called "~" wherever the process happens to be.
-            _SETTINGS.CACHE_DIR = before or str(cache_folder("numba"))
-            kept: Callable[..., Any] = njit(function, cache=True, nogil=True, **options)
-        except (RuntimeError, UsageError):  # There is no place that can be written.
-            kept = njit(function, nogil=True, **options)
-        finally:
-            _SETTINGS.CACHE_DIR = before
-        return kept
-
-    return compiled
-
-
-@_compiled()
+@compiled()
 def _tree(points: Float32, height: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Sort points into leaves: their order, [N], and where in it each leaf begins, and the end, [L + 1]."""
     order = np.arange(len(points))
@@ -85,7 +60,7 @@ def _tree(points: Float32, height: int) -> tuple[NDArray[np.int64], NDArray[np.i
     return order, bounds[: leaves + 1]
 
 
-@_compiled()
+@compiled()
 def _split(order: NDArray[np.int64], points: Float32, left: int, right: int) -> int:
     """Divide `order[left:right]` at the mean of the widest axis; returns where the right half begins."""
     axis, widest = 0, np.float32(0)
@@ -115,7 +90,7 @@ def _split(order: NDArray[np.int64], points: Float32, left: int, right: int) -> 
     return min(max(start, left + 1), right - 1)
 
 
-@_compiled()
+@compiled()
 def _furthest(x: Float32, y: Float32, z: Float32, bounds: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """The samples, [K], of points that stand leaf by leaf; coordinates [N] each, bounds [L + 1]."""
     leaves = len(bounds) - 1
@@ -158,7 +133,7 @@ def _furthest(x: Float32, y: Float32, z: Float32, bounds: NDArray[np.int64], cou
 
 
 # Finite numbers alone: so the greatest of several can be found by vector instructions. Rounding stays as it is.
-@_compiled(fastmath={"nnan", "nsz"})
+@compiled(fastmath={"nnan", "nsz"})
 def _compare(x: Float32, y: Float32, z: Float32, squared: Float32, left: int, right: int, sample: int) -> np.float32:
     """Lower the distances of the points of a leaf to one sample; returns the greatest that is left."""
     at_x, at_y, at_z = x[sample], y[sample], z[sample]

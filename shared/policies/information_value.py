@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from shared.policies.adaptation import Adapter, action_from_frame, movable_points
+from shared.policies.adaptation import Adapter, Proposals, movable_points, reachable_action
 from shared.policies.methods import ProposerKind
 from shared.policies.proposers import TOP_POINTS, best_points
 from shared.types import Action, Interaction, Observation
@@ -41,10 +41,18 @@ class InformationValueProposer:
         points = self._points(observation, history)
         latent = self.adapter.z(history)
         proposals = [self.adapter.proposals(observation, int(point), self.rng) for point in points]
-        best = [int(self.adapter.score_proposals(observation, each, latent).argmax()) for each in proposals]
-        frames = torch.stack([each.frames[place] for each, place in zip(proposals, best, strict=True)])
-        chosen = int(self._values(observation, points, frames, history).argmax())
-        return action_from_frame(observation, int(points[chosen]), frames[chosen])
+        scores = [self.adapter.score_proposals(observation, each, latent) for each in proposals]
+        frames = torch.stack([own.frames[int(s.argmax())] for own, s in zip(proposals, scores, strict=True)])
+        values = self._values(observation, points, frames, history)
+
+        def choose(left: NDArray[np.int64]) -> int:
+            return int(left[values[torch.from_numpy(left)].argmax()])
+
+        def act(point: int) -> tuple[Proposals, Tensor]:
+            place = int(np.flatnonzero(points == point)[0])
+            return proposals[place], scores[place]
+
+        return reachable_action(observation, points, choose, act)
 
     def _points(self, observation: Observation, history: Sequence[Interaction]) -> NDArray[np.int64]:
         movable = movable_points(observation)

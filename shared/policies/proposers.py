@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from shared.errors import UsageError
-from shared.policies.adaptation import Adapter, action_from_frame, movable_points
+from shared.policies.adaptation import Adapter, Proposals, movable_points, reachable_action
 from shared.policies.critics import best_action, critic_named, critic_names
 from shared.policies.methods import PROPOSERS, CriticName, ProposerKind
 from shared.types import Action, Float32, Interaction, Observation, Proposer
@@ -62,13 +63,17 @@ class AipProposer:
         information = self.adapter.information(observation, candidates, latent)
         if len(history) >= self.at_least and float(information.max()) < self.threshold:
             return None
-        if self.share is None:
-            point = int(candidates[information.argmax()])
-        else:
-            point = drawn_point(candidates, information, points_of(self.share, observation), self.rng)
-        proposals = self.adapter.proposals(observation, point, self.rng)
-        best = int(self.adapter.information_proposals(observation, proposals, latent).argmax())
-        return action_from_frame(observation, point, proposals.frames[best])
+
+        def choose(left: NDArray[np.int64]) -> int:
+            if self.share is None:
+                return int(left[information[left].argmax()])
+            return drawn_point(left, information[left], points_of(self.share, observation), self.rng)
+
+        def act(point: int) -> tuple[Proposals, Tensor]:
+            proposals = self.adapter.proposals(observation, point, self.rng)
+            return proposals, self.adapter.information_proposals(observation, proposals, latent)
+
+        return reachable_action(observation, candidates, choose, act)
 
 
 AIP = ProposerKind(
@@ -102,8 +107,11 @@ class ExploitProposer:
         candidates = movable_points(observation)
         scores = self.critic.affordance(observation, candidates, history)
         count = TOP_POINTS if self.share is None else points_of(self.share, observation)
-        point = drawn_point(candidates, scores, count, self.rng)
-        return best_action(self.critic, self.adapter, observation, point, history, self.rng)
+
+        def choose(left: NDArray[np.int64]) -> int:
+            return drawn_point(left, scores[left], count, self.rng)
+
+        return best_action(self.critic, self.adapter, observation, candidates, choose, history, self.rng)
 
 
 def points_of(share: float, observation: Observation) -> int:

@@ -35,6 +35,9 @@ HIDDEN_VERSION = 2
 """Of stores with further hidden parameters: software that knows version 1 alone would compute another digest."""
 DEPTH_VERSION = 3
 """Of stores that keep depth images, with or without further hidden parameters: older software does not know them."""
+ARM_VERSION = 4
+"""Of stores whose hand an arm carries, with or without these two: older software does not know its outcomes."""
+READ_VERSIONS = (SCHEMA_VERSION, HIDDEN_VERSION, DEPTH_VERSION, ARM_VERSION)
 STORE_FILE = "store.json"
 MANIFEST_FILE = "manifest.json"
 INTERACTIONS_FILE = "interactions.parquet"
@@ -68,10 +71,16 @@ PLAN_KEY = r"[a-z][a-z0-9-]{0,30}-v[0-9]{1,9}"
 _SHARD_ID = re.compile(rf"(?P<plan>{PLAN_KEY})-(?P<start>[0-9]{{8,12}})-(?P<stop>[0-9]{{8,12}})")
 
 
-def schema_version(added: Sequence[str], keeps_depth: bool) -> int:
-    """The version of documents about rollouts with hidden parameters that not every store has, or with depth images."""
-    if keeps_depth:
-        return DEPTH_VERSION
+def schema_version(added: Sequence[str], keeps_depth: bool, has_arm: bool) -> int:
+    """The version of documents about rollouts, by what not every store has.
+
+    Args:
+        added: hidden parameters.
+        keeps_depth: whether there are depth images.
+        has_arm: whether an arm carries the hand.
+    """
+    if has_arm or keeps_depth:
+        return ARM_VERSION if has_arm else DEPTH_VERSION
     return HIDDEN_VERSION if added else SCHEMA_VERSION
 
 
@@ -152,7 +161,8 @@ class ShardManifest(StrictModel):
 
 
 def _version_of(setting: Setting) -> int:
-    return schema_version(setting.dynamics.added, setting.collection.camera.keep_depth)
+    collection = setting.collection
+    return schema_version(setting.dynamics.added, collection.camera.keep_depth, collection.arm is not None)
 
 
 class StoreDocument(StrictModel):
@@ -209,11 +219,12 @@ def check_schema_version(content: dict[str, Any], source: str) -> None:
         StoreError: it names no version, or was damaged where it names it.
     """
     version = content.get("schema_version")
-    versions = (SCHEMA_VERSION, HIDDEN_VERSION, DEPTH_VERSION)
-    if version in versions and type(version) is int:
+    if version in READ_VERSIONS and type(version) is int:
         return
     # A flipped bit in the number itself is damage: with the right number, the document is what was sealed.
-    if not isinstance(version, int) or any(has_checksum(content | {"schema_version": right}) for right in versions):
+    if not isinstance(version, int) or any(
+        has_checksum(content | {"schema_version": right}) for right in READ_VERSIONS
+    ):
         raise StoreError(f"{source}: names no schema version; the file is damaged: restore it from a copy")
     older = (
         "run `adaafford store migrate STORE --out NEW`"
@@ -221,7 +232,7 @@ def check_schema_version(content: dict[str, Any], source: str) -> None:
         else "use the software that wrote it, or newer"
     )
     raise SchemaVersionError(
-        f"{source}: schema version {version}, but this software reads {SCHEMA_VERSION} to {DEPTH_VERSION}; {older}"
+        f"{source}: schema version {version}, but this software reads {SCHEMA_VERSION} to {READ_VERSIONS[-1]}; {older}"
     )
 
 

@@ -306,6 +306,7 @@ def _rollout(
         status=RolloutStatus(head["status"]),
         observations=observations,
         interactions=tuple(_interaction(row) for row in rows),
+        arm_base=tuple(head["arm_base"].tolist()),
     )
 
 

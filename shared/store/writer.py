@@ -84,7 +84,7 @@ def commit_shard(
     pixels = observations.depth_size(observation for rollout in rollouts for observation in rollout.observations)
     files = _encode(rollouts, clouds, points, pixels, unknown.tables)
     manifest = ShardManifest(
-        schema_version=schema_version(rollouts[0].dynamics.added, pixels > 0),
+        schema_version=schema_version(rollouts[0].dynamics.added, pixels > 0, any(each.arm_base for each in rollouts)),
         plan_key=job.plan_key,
         start=job.start,
         stop=job.stop,

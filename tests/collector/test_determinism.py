@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -47,9 +49,11 @@ def fresh(objects: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
     return collected(tmp_path_factory.mktemp("fresh") / "store", objects, workers=0, per_shard=ROLLOUTS)
 
 
-def collected(path: Path, objects: Path, workers: int, per_shard: int) -> Store:
+def collected(
+    path: Path, objects: Path, workers: int, per_shard: int, more: Mapping[str, object] = MappingProxyType({})
+) -> Store:
     """The store of `adaafford collect` in a process of its own."""
-    flags = FLAGS | {"objects": objects, "store": path, "workers": workers, "per-shard": per_shard}
+    flags = FLAGS | more | {"objects": objects, "store": path, "workers": workers, "per-shard": per_shard}
     words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
     program = "import sys; from cluster.cli.main import main; main()"
     subprocess.run([sys.executable, "-c", program, "collect", *words], check=True, capture_output=True)

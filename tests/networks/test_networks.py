@@ -245,7 +245,7 @@ def test_outcome_details_of_every_kind_and_width_differ_and_unknown_ones_are_zer
     told = outcome_details(kinds, [float("nan")] * len(OutcomeKind) + [0.02])
     assert told.shape == (len(kinds), DETAIL_WIDTH)
     nothing = [row for kind, row in zip(kinds, told, strict=True) if kind not in TOLD_KINDS]
-    assert len(nothing) == 2
+    assert len(nothing) == 3
     assert not np.any(nothing)
     assert len({row.tobytes() for row in told}) == len(TOLD_KINDS) + 2
     hostile = outcome_details(["ok", "no-such-kind"], [float("inf"), 1e300])

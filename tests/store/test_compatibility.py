@@ -169,7 +169,7 @@ def test_a_run_a_policy_and_a_history_of_the_first_version_open(
     assert json.loads(capsys.readouterr().out)["tries"] == 1
 
 
-@pytest.mark.parametrize("version", [0, 4])
+@pytest.mark.parametrize("version", [0, 5])
 @pytest.mark.parametrize("place", ["store.json", "manifest.json", "index.json"])
 @pytest.mark.parametrize("action", ["verify", "repair", "compact", "digest", "info", "merge", "export"])
 def test_another_schema_version_is_refused_in_a_line_and_nothing_is_touched(
@@ -195,10 +195,10 @@ def test_another_schema_version_is_refused_in_a_line_and_nothing_is_touched(
 def test_a_lost_description_of_a_store_of_another_version_is_not_made_anew(tmp_path: Path) -> None:
     store = make(tmp_path / "store")
     for shard in shards_of(store):
-        edit(shard / "manifest.json", schema_version=4)
+        edit(shard / "manifest.json", schema_version=5)
     (store.path / "store.json").unlink()
     before = contents(store.path)
-    with pytest.raises(SchemaVersionError, match="schema version 4"):
+    with pytest.raises(SchemaVersionError, match="schema version 5"):
         repair(store.path)
     assert contents(store.path) == before
 
@@ -370,7 +370,7 @@ def test_what_cannot_be_migrated_is_refused(older: None, tmp_path: Path) -> None
     current = make(tmp_path / "current")
     with pytest.raises(UsageError, match="nothing to migrate"):
         migrate(current.path, tmp_path / "new")
-    edit(current.path / "store.json", schema_version=4)
+    edit(current.path / "store.json", schema_version=5)
     with pytest.raises(SchemaVersionError, match="newer"):
         migrate(current.path, tmp_path / "new")
     edit(current.path / "store.json", schema_version=-1)

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from adaafford.sessions import Session
 
 MAX_LINE_BYTES = 1 << 16
+MAX_BASE = 100.0
+"""m or rad."""
 MIN_SHOWN, MAX_SHOWN = 64, 16384
 """Of a scan's points, as in the configuration of the simulated camera."""
 
@@ -59,6 +61,11 @@ class AdaptCommand:
     """How many points of a scan the policy receives: as many as in its training (see its model card)."""
     seed: int = 0
     """Of the random draws."""
+    arm: str | None = None
+    """The arm that executes the actions: panda, ur5e, FILE.urdf, or FILE.urdf#LINK where LINK carries the hand. Only
+    what it reaches is proposed, with the joint trajectory; the heatmap shows in grey what it does not reach."""
+    base: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """With --arm: X Y Z YAW of its base in the scan's frame: m, and rad about --up from x."""
     follow: bool = False
     """Keep running: for each line {"cloud": "scan-2.ply", "outcome": {"motion": 0.2}} on standard input, print the next
     step. A step then takes a fraction of a second, because the policy stays loaded."""
@@ -82,14 +89,30 @@ def main(args: list[str]) -> int:
         raise UsageError(f"--points {command.points}: allowed are {MIN_SHOWN} to {MAX_SHOWN}")
     if command.seed < 0:
         raise UsageError(f"--seed {command.seed}: needs a number that is not negative")
+    if command.arm is None and any(command.base):
+        raise UsageError("--base says where the base of --arm stands; name the arm")
+    if not all(abs(number) <= MAX_BASE for number in command.base):
+        raise UsageError(f"--base {command.base}: X Y Z YAW are finite numbers, at most {MAX_BASE:g}: m and rad")
     from adaafford.histories import TriedOutcome
     from adaafford.pretrained import load_policy, only_pretrained
     from adaafford.sessions import Session, SessionFiles
+    from shared.arms.arm import arm_of
     from shared.config import parse
 
     files = SessionFiles(command.history, command.out or command.history.parent / "heatmap.ply")
     policy = load_policy(command.policy or only_pretrained())
-    session = Session(policy, files, command.budget, command.seed, command.up, command.camera, command.points, _say)
+    session = Session(
+        policy,
+        files,
+        command.budget,
+        command.seed,
+        command.up,
+        command.camera,
+        command.points,
+        _say,
+        None if command.arm is None else arm_of(command.arm),
+        command.base,
+    )
     told = {
         "motion": command.outcome,
         "success": command.success,

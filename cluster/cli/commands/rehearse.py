@@ -1,5 +1,6 @@
 """`adaafford rehearse`: a simulated robot behind the protocol of `adaafford adapt --follow`."""
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -54,6 +55,9 @@ class RehearseCommand:
     """Strength of the scans' errors: 0 is none, 1 a structured-light camera one metre from the object."""
     marked: bool = True
     """Whether scans mark the points of the part that is to be moved."""
+    arm: str | None = None
+    """The arm that carries the hand, as for `adapt`: what it cannot reach is answered by "unreachable". The scans are
+    then in a frame whose origin is its base. Without --policy, standard error says how `adapt` is to be called."""
     seed: int = 1
     """Everything random derives from it: objects, hidden dynamics, camera, states, noise."""
 
@@ -105,7 +109,8 @@ def _robots(command: RehearseCommand) -> Iterator["SimulatedRobot"]:
     if objects is None:
         objects = command.folder / "objects"
         generate(objects, dict.fromkeys(built_in_categories(task_of(command.task), ()), BUILT_IN_PER_CATEGORY), 1)
-    for number, environment in enumerate(islice(simulated(objects, command.task, command.seed), command.rollouts)):
+    found = simulated(objects, command.task, command.seed, command.arm)
+    for number, environment in enumerate(islice(found, command.rollouts)):
         folder = command.folder if command.rollouts == 1 else command.folder / f"{number + 1:04d}"
         make_folder(folder)
         setting = Setting(
@@ -115,6 +120,7 @@ def _robots(command: RehearseCommand) -> Iterator["SimulatedRobot"]:
             number=number,
             noise=command.noise,
             marked=command.marked,
+            arm=command.arm,
         )
         yield SimulatedRobot(environment, setting, folder)
 
@@ -126,6 +132,9 @@ def _follow(robot: "SimulatedRobot") -> int:
     from cluster.cli.commands.adapt import answer_lines
 
     advice = "write an answer of adapt --follow"
+    if robot.base is not None:
+        base = " ".join(f"{number:.6f}" for number in robot.base)
+        print(f"adaafford: adapt needs --arm and --base {base}", file=sys.stderr, flush=True)
     print(_line(robot.request), flush=True)
     answer_lines(advice, lambda line: _line(robot.execute(parse_json(Step, line, "", advice))))
     return 0
@@ -135,10 +144,12 @@ def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy")
     """A whole session with one robot; whether it succeeded."""
     from adaafford.sessions import Session, SessionFiles
     from cluster.evaluation.rehearsal import Goal, rehearse
+    from shared.arms.arm import arm_of
 
     folder = robot.folder
     files = SessionFiles(folder / "history.json", folder / "heatmap.ply")
-    session = Session(policy, files, command.budget, command.seed)
+    arm = None if command.arm is None else arm_of(command.arm)
+    session = Session(policy, files, command.budget, command.seed, arm=arm, base=robot.base or (0.0, 0.0, 0.0, 0.0))
 
     def tell(step: "Step", request: "Request") -> None:
         assert request.outcome is not None, "an action has an outcome"

@@ -11,7 +11,6 @@ from pydantic_core import from_json
 
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.bounds import check_bounds
-from collector.objects.files import short
 from collector.objects.importing.layouts import Source, read_urdf
 from collector.objects.importing.placement import Placement, opening_upwards, settled
 from collector.objects.importing.sources import SourceFiles
@@ -23,7 +22,7 @@ from collector.objects.writing import write_object
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.extras import require_packages
 from shared.io.files import TEMPORARY_PREFIX, read_bounded, remove_tree
-from shared.io.text import plain
+from shared.io.text import plain, short
 
 MAX_META_BYTES = 1 << 20
 IMPORTED = "imported_from"

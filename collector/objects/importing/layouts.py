@@ -7,15 +7,16 @@ from typing import Literal
 
 from pydantic_core import from_json
 
-from collector.objects.files import ObjectFiles, short
+from collector.objects.files import ObjectFiles
 from collector.objects.importing.mesh_files import ENDINGS, MeshParser
 from collector.objects.importing.placement import AS_IT_IS, Direction
 from collector.objects.importing.sources import SourceFiles
 from collector.objects.partnet import MAX_TEXT_BYTES, META_FILE, SEMANTICS_FILE, URDF_FILE, category_of, part_names
 from collector.objects.readers import Description
-from collector.objects.urdf import MAX_URDF_BYTES, parse_urdf
 from collector.objects.urdf_bodies import UrdfBodies, UrdfMeshes, joint_notes
 from shared.errors import ObjectError, UsageError
+from shared.io.text import short
+from shared.urdf import MAX_URDF_BYTES, parse_urdf
 
 Layout = Literal["urdf", "mjcf", "gapartnet", "articulate-anything"]
 ENDING_OF = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"}

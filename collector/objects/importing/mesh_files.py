@@ -9,10 +9,10 @@ from collector.objects import meshes
 from collector.objects.articulation import Mesh
 from collector.objects.child_process import ChildProcess
 from collector.objects.mesh_bytes import decode
-from collector.objects.urdf import MESH_ENDINGS
 from shared.errors import ObjectError
 from shared.extras import require_packages
 from shared.io.text import plain
+from shared.urdf import MESH_ENDINGS
 
 FOREIGN_ENDINGS = {".dae": ("trimesh", "pycollada"), ".glb": ("trimesh",), ".ply": ("trimesh",)}
 """Endings of files that other packages read, and these packages."""

@@ -17,16 +17,15 @@ import numpy as np
 
 from collector.objects import meshes
 from collector.objects.articulation import Body, Joint, Mesh
-from collector.objects.files import short
 from collector.objects.importing.layouts import UNKNOWN_CATEGORY
 from collector.objects.importing.mesh_files import MeshParser, capsule
 from collector.objects.importing.sources import SourceFiles
 from collector.objects.readers import Description
-from collector.objects.urdf import MAX_LINKS, MAX_SHAPES, parse_xml
 from collector.objects.urdf_bodies import MAX_OBJECT_TRIANGLES, MAX_OBJECT_VERTICES, listed
 from shared.errors import ObjectError
-from shared.io.text import plain
+from shared.io.text import plain, short
 from shared.types import Float
+from shared.urdf import MAX_LINKS, MAX_SHAPES, parse_xml
 
 MAX_BYTES = 4 << 20
 """Of one document."""

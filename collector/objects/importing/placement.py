@@ -6,9 +6,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from collector.objects.articulation import MIN_RANGE
-from collector.objects.files import short
 from collector.objects.model import ObjectModel, bounding_box, transformed
 from shared.errors import ObjectError, UsageError
+from shared.io.text import short
 from shared.types import Float
 
 Direction = Literal["+x", "-x", "+y", "-y", "+z", "-z"]

@@ -5,9 +5,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from collector.objects.files import ObjectFiles, short
+from collector.objects.files import ObjectFiles
 from collector.objects.urdf_bodies import listed
 from shared.errors import ObjectError, UsageError
+from shared.io.text import short
 
 SCHEMES = ("package", "model", "file")
 

@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from collector.objects.files import short
 from collector.objects.procedural.catalogue import CATEGORIES, build
 from collector.objects.writing import write_object
 from shared.errors import UsageError
 from shared.io.files import TEMPORARY_PREFIX, remove_if_abandoned
+from shared.io.text import short
 
 
 def generate(out: Path, counts: Mapping[str, int], seed: int) -> list[Path]:

@@ -213,6 +213,15 @@ def _rollout_columns() -> tuple[Column[RolloutRow], ...]:
         Column("observations", "<i8", 0, "how many", lambda x: len(r(x).observations)),
         Column("interactions", "<i8", 0, "how many", lambda x: len(r(x).interactions)),
         Column("first_observation", "<i8", 0, "index in the shard", lambda x: x.first_observation, content=False),
+        Column(
+            "arm_base",
+            "<f8",
+            LIST,
+            "x, y, z, yaw of the arm's base, world; empty: the hand flies",
+            lambda x: r(x).arm_base,
+            content=False,
+            default=(),
+        ),
     )
 
 
@@ -308,8 +317,8 @@ def fingerprint(*tables: Sequence[Column[Any]]) -> str:
 
 
 ROLLOUT_COLUMNS = _rollout_columns()
-_OF_SHARD_OR_EXTENT = ("status", "observations", "interactions", "first_observation")
-COPIED_COLUMNS = tuple(column.name for column in ROLLOUT_COLUMNS if column.name not in _OF_SHARD_OR_EXTENT)
+_NOT_COPIED = ("status", "observations", "interactions", "first_observation", "arm_base")
+COPIED_COLUMNS = tuple(column.name for column in ROLLOUT_COLUMNS if column.name not in _NOT_COPIED)
 """Columns of interactions.parquet that repeat the row's rollout."""
 INTERACTION_COLUMNS = (
     *(_of_rollout(column) for column in ROLLOUT_COLUMNS if column.name in COPIED_COLUMNS),

@@ -18,11 +18,11 @@ from shared.store import policies, reader
 from shared.store.backends.base import Folder, StorageBackend, backend_of
 from shared.store.codecs.checksummed import with_checksum, without_checksum
 from shared.store.layout import (
-    HIDDEN_VERSION,
     MANIFEST_FILE,
     MAX_DOCUMENT_BYTES,
     PLANS_FOLDER,
     POLICIES_FOLDER,
+    READ_VERSIONS,
     SCHEMA_VERSION,
     STATUS_FOLDER,
     STORE_FILE,
@@ -111,7 +111,7 @@ def migrate(where: str | Path, out: str | Path, progress: Callable[[int, int], N
 
 def _steps(version: Any, where: str) -> list[MigrationStep]:
     """What leads from a version to the current one."""
-    if version in (SCHEMA_VERSION, HIDDEN_VERSION):
+    if version in READ_VERSIONS:
         raise UsageError(f"{where}: is of schema version {version}, which this software reads; nothing to migrate")
     if not isinstance(version, int) or not all(number in STEPS for number in range(version, SCHEMA_VERSION)):
         raise SchemaVersionError(f"{where}: no migration leads from schema version {version} to {SCHEMA_VERSION}")

@@ -1,4 +1,4 @@
-"""URDF, as far as PartNet-Mobility needs it: a tree of links with shapes, joined by joints, all of it checked.
+"""URDF of objects and of arms: a tree of links with shapes, joined by joints, all of it checked.
 
 Inertias, materials and dynamics are skipped: hidden dynamics are drawn for each rollout instead.
 """
@@ -10,12 +10,11 @@ from dataclasses import dataclass, field
 from typing import Literal, cast, get_args
 from xml.etree.ElementTree import Element, ParseError
 
-import defusedxml
-import defusedxml.ElementTree
 import numpy as np
 
-from collector.objects.files import short
 from shared.errors import ObjectError
+from shared.extras import require_packages
+from shared.io.text import short
 from shared.types import Float
 
 MAX_URDF_BYTES = 2 << 20
@@ -168,9 +167,14 @@ def parse_xml(data: bytes, most_bytes: int) -> Element:
 
     Raises:
         ObjectError: with one line that says what is wrong.
+        UsageError: the package that reads XML safely is not installed.
     """
     if len(data) > most_bytes:
         raise ObjectError(f"{len(data)} bytes; at most {most_bytes} are allowed")
+    require_packages("a URDF", "defusedxml")
+    import defusedxml
+    import defusedxml.ElementTree
+
     try:
         return cast(Element, defusedxml.ElementTree.fromstring(data, forbid_dtd=True))
     except defusedxml.DefusedXmlException as error:
@@ -205,16 +209,22 @@ def _numbers(element: Element | None, attribute: str, default: str, count: int) 
 def _pose(element: Element) -> Float:
     """[4, 4], of an element's `<origin>`: roll, pitch, yaw about fixed axes, then the translation."""
     origin = element.find("origin")
-    roll, pitch, yaw = _numbers(origin, "rpy", "0 0 0", 3)
-    (sr, sp, sy), (cr, cp, cy) = np.sin([roll, pitch, yaw]), np.cos([roll, pitch, yaw])
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
+    pose[:3, :3] = rotation_from_rpy(*_numbers(origin, "rpy", "0 0 0", 3))
     pose[:3, 3] = _numbers(origin, "xyz", "0 0 0", 3)
     return pose
+
+
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Float:
+    """[3, 3], of roll, pitch and yaw about fixed axes."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin([roll, pitch, yaw]), np.cos([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
 
 
 def _shape(element: Element, mesh_endings: tuple[str, ...]) -> Shape:

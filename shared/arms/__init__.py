@@ -1,0 +1,1 @@
+"""Arms: their kinematics, and whether one can carry the hand along a primitive."""
