@@ -243,7 +243,7 @@ class CollectionConfig(StrictModel):
     primitive: Name | None = None
     """Instead of the task's own: push, push-left, push-up, pull, pull-left, pull-up, or what a package adds."""
     gripper: Name = Field(PANDA, exclude_if=lambda name: name == PANDA)
-    """The hand: panda, or what a package adds. Documents leave out the default, which they did not know once."""
+    """The hand: panda, suction, or what a package adds. Documents leave out the default, which was once unknown."""
     simulator: Name = Field(SAPIEN, exclude_if=lambda name: name == SAPIEN)
     """What rollouts are simulated with: sapien, or what a package adds; left out likewise."""
     camera: CameraConfig = CameraConfig()
