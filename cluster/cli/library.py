@@ -86,7 +86,7 @@ def simulated(objects: str | Path, task: str, seed: int = 1, gripper: str = PAND
         gripper: the hand, as `collection.gripper` names it.
 
     Raises:
-        UsageError: there is no such task or hand, or no object that the task applies to comes to rest in view of the camera.
+        UsageError: there is no such task or hand, or no object of the task comes to rest in view of the camera.
     """
     require("adaafford.simulated", "collect", without=("ray",))
     from collector.simulated_objects import SimulatedObjects

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from cluster.config.flags import parse_flags
-from shared.config import PANDA
+from shared.config import MAX_NOISE, PANDA
 from shared.errors import UsageError
 from shared.extras import require
 from shared.io.files import make_folder
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from shared.policies.policy import Policy
 
 BUILT_IN_PER_CATEGORY = 4
-MAX_ROLLOUTS, MAX_NOISE = 1000, 10.0
+MAX_ROLLOUTS = 1000
 
 
 @dataclass(frozen=True, slots=True)
