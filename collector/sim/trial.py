@@ -251,6 +251,7 @@ class Trial:
         self.steps += 1
         if self._closed:
             self._attached = self.scene.gripper.attached()
+            self._brushed = self._brushed or self._attached
         if not self._checked:
             self._check_first_contact()
         if first:
@@ -275,7 +276,7 @@ class Trial:
                 raise _TrialEndedError(OutcomeKind.HAND_CONTACT)
             if self.primitive.checks_contact and contact.finger_on - {self.target}:
                 raise _TrialEndedError(OutcomeKind.WRONG_PART)
-        self._checked = contact.presses or (not self.primitive.checks_contact and contact.brushes)
+        self._checked = contact.presses or (not self.primitive.checks_contact and self._brushed)
 
     def _succeeded(self, start: float, end: float, displacement: Float) -> bool:
         low, high = self.scene.limits[self.target - 1]

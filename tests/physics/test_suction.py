@@ -116,6 +116,15 @@ def test_a_seal_needs_a_flat_face_of_one_body_that_is_wider_than_the_rim() -> No
         assert (inside, across) == (OutcomeKind.OK, OutcomeKind.NO_GRASP)
 
 
+def test_a_seal_counts_as_a_contact_where_only_the_lip_reaches_the_surface() -> None:
+    # The hand ends 0.1 before p, and its tip 0.0124 behind p.
+    kinds = {}
+    for gap in (0.003, 0.009):
+        outcome = pull(door(), aimed((-0.32 - 0.0124 - gap, -0.1, 0.1)))
+        kinds[gap] = outcome.kind, outcome.success
+    assert kinds == {0.003: (OutcomeKind.OK, True), 0.009: (OutcomeKind.NO_GRASP, False)}
+
+
 def test_a_seal_needs_a_cup_that_faces_the_surface() -> None:
     kinds = {slant: pull(door(), aimed((-0.32, 0.0, 0.1), slant)).kind for slant in (0, 18, 22, 35)}
     assert kinds == {0: OutcomeKind.OK, 18: OutcomeKind.OK, 22: OutcomeKind.NO_GRASP, 35: OutcomeKind.NO_GRASP}
