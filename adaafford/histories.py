@@ -69,7 +69,8 @@ class TriedOutcome(StrictModel):
     kind: OutcomeKind = OutcomeKind.UNKNOWN
     """How the interaction ended; of these kinds, a robot usually knows only "ok", "no-contact" and "no-grasp"."""
     grasp_width: float | None = Field(None, ge=0, le=MAX_GRASP_WIDTH)
-    """Opening of the two fingers together after they closed, m; None: not measured, or nothing closed."""
+    """Opening of the two fingers together after they closed, m; of a suction cup its diameter if it sealed, else 0.
+    None: not measured, or nothing closed."""
 
     @property
     def outcome(self) -> Outcome:

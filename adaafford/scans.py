@@ -29,7 +29,7 @@ from shared.config import CameraConfig, StrictModel, parse
 from shared.errors import UsageError
 from shared.geometry import camera_pose, gripper_rotation
 from shared.io.files import read_bounded
-from shared.observation import furthest_first, round_normals, round_points
+from shared.observation import estimated_normals, facing, furthest_first, round_normals, round_points
 from shared.types import Action, Float, Float32, Observation
 
 MIN_POINTS, MAX_POINTS = 64, 1920 * 1080
@@ -42,7 +42,6 @@ MAX_EXTENT_M = 10.0
 MAX_OFF_CLOUD_M = 0.05
 """How far from the kept points an action's point may lie; they are a few centimetres apart at the most."""
 READERS = {".ply": read_ply, ".npz": read_npz, ".pcd": read_pcd}
-_NORMAL_NEIGHBOURS = 16
 _MIN_NORMAL = 1e-9
 _MISSING_SHARE = 0.1
 """What a depth camera misses without anybody being told."""
@@ -300,7 +299,7 @@ def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = PO
         raise UsageError("the cloud has no movable point; look from another side, or mark the points to act on")
     return Observation(
         points=round_points(places),
-        normals=round_normals(_facing(normals, places, world_from_camera[:3, 3])),
+        normals=round_normals(facing(normals, places, world_from_camera[:3, 3])),
         part_ids=movable.astype(np.uint8),
         movable=movable,
         pixels=(kept if scan.rows is None else scan.rows[kept]).astype(np.uint32),
@@ -415,22 +414,6 @@ def _mask(values: NDArray[np.generic], source: str) -> NDArray[np.bool_]:
             "act on and 0 for all others"
         )
     return values.astype(bool)
-
-
-def estimated_normals(cloud: Float, points: Float) -> Float:
-    """Normals of local planes, [N, 3], of either sign."""
-    _, near = cKDTree(cloud).query(points, k=min(_NORMAL_NEIGHBOURS, len(cloud)))
-    local = cloud[near] - cloud[near].mean(axis=1, keepdims=True)
-    normals: Float = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
-    return normals
-
-
-def _facing(normals: Float, points: Float, camera: Float) -> Float:
-    """Unit normals that face the camera."""
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    towards = (normals * (camera - points)).sum(axis=1, keepdims=True)
-    facing: Float = np.where(towards < 0, -normals, normals)
-    return facing
 
 
 def _narrow(values: Float) -> NDArray[np.generic]:

@@ -18,6 +18,8 @@ from shared.types import Order
 MAX_CONFIGURATION_BYTES = 1 << 18
 MAX_DEPTH_SIZE = 1024
 """Width and height, pixels, of a depth image that is kept."""
+MAX_NOISE = 10.0
+"""Of a depth camera, times what a real one has."""
 MAX_DOTS = 100
 """In a line of a configuration file, paths included."""
 
@@ -93,6 +95,10 @@ class CameraConfig(StrictModel):
     keep_depth: bool = Field(False, exclude_if=lambda kept: not kept)
     """Keep the whole depth image of each observation beside its cloud, some KB, which `network.pinch_profile` needs:
     `run` and `evaluate --policy` then switch it on."""
+
+    noise: float = Field(0.0, ge=0, le=MAX_NOISE, exclude_if=lambda noise: noise == 0)
+    """Factor of the errors of a depth camera (`collector.sim.depth_noise`): 0 for none, 1 for a structured-light camera
+    at one metre. Normals are then estimated from what it measured, as those of a robot's scan are."""
 
     @property
     def depth_size(self) -> int:
@@ -243,7 +249,7 @@ class CollectionConfig(StrictModel):
     primitive: Name | None = None
     """Instead of the task's own: push, push-left, push-up, pull, pull-left, pull-up, or what a package adds."""
     gripper: Name = Field(PANDA, exclude_if=lambda name: name == PANDA)
-    """The hand: panda, or what a package adds. Documents leave out the default, which they did not know once."""
+    """The hand: panda, suction, or what a package adds. Documents leave out the default, which was once unknown."""
     arm: str | None = Field(None, max_length=1000, exclude_if=lambda arm: arm is None)
     """The arm that carries the hand: panda, ur5e, what a package adds, or FILE.urdf, or FILE.urdf#LINK where LINK
     carries the hand. What it cannot reach is not executed (`unreachable`). None: the hand flies."""

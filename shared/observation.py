@@ -1,4 +1,4 @@
-"""Selection and rounding of the points of a cloud, so that a proposer sees exactly what the learner will read.
+"""Selection, normals and rounding of the points of a cloud, so that a proposer sees exactly what the learner will read.
 
 Points are kept as float16 (about 0.5 mm at 1 unit), normals as three signed bytes of 1/127 (within half a degree).
 Shapes: N points; any leading shape will do.
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from shared.types import Float, Float32
 
 NORMAL_STEPS = 127
+NORMAL_NEIGHBOURS = 16
 
 
 def furthest_first(points: Float | Float32, count: int, candidates: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -34,6 +35,30 @@ def furthest_first(points: Float | Float32, count: int, candidates: int, rng: np
         chosen = np.concatenate([chosen, rng.integers(len(points), size=count - len(points))])
     kept: NDArray[np.int64] = chosen[furthest_points(points[chosen].astype(np.float32), count)]
     return kept
+
+
+def estimated_normals(cloud: Float, points: Float) -> Float:
+    """Normals of a measured surface: of the planes through the nearest points, [N, 3], of either sign.
+
+    Args:
+        cloud: [M, 3], all that was measured.
+        points: [N, 3], where.
+    """
+    from scipy.spatial import cKDTree
+
+    _, near = cKDTree(cloud).query(points, k=min(NORMAL_NEIGHBOURS, len(cloud)))
+    near = near.reshape(len(points), -1)
+    local = cloud[near] - cloud[near].mean(axis=1, keepdims=True)
+    normals: Float = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
+    return normals
+
+
+def facing(normals: Float, points: Float, camera: Float) -> Float:
+    """Unit normals, [N, 3], that face a camera, [3], from `points`, [N, 3]."""
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    towards = (normals * (camera - points)).sum(axis=1, keepdims=True)
+    turned: Float = np.where(towards < 0, -normals, normals)
+    return turned
 
 
 def round_points(points: Float | Float32) -> Float32:

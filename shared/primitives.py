@@ -36,8 +36,8 @@ class PrimitiveSpec:
         then: the second leg, at the slower timing of `Fidelity.drag`; None: there is none.
         intended: [3], start frame, the unit direction in which the touched point must move, up to 60 deg; None: any.
             Whatever it is, the joint must move by more than 0.01 rad or m, or half of its range.
-        closes_fingers: whether the fingers start open and close after the approach; a trial without
-            a grasp then ends ("no-grasp").
+        closes_fingers: whether the hand closes after the approach: fingers that started open, or the valve of a
+            suction cup. A trial in which it then holds nothing ends ("no-grasp").
         checks_contact: whether a first contact of the palm, or of a finger with another part than the target, ends the
             trial ("hand-contact", "wrong-part").
         needs_friction: whether friction between hand and part carries the part along, so that the engine takes the

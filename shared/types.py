@@ -39,7 +39,7 @@ class OutcomeKind(StrEnum):
     NO_CONTACT = "no-contact"
     """It ran to its end and touched nothing."""
     NO_GRASP = "no-grasp"
-    """The fingers closed on nothing (together open by at most 0.01)."""
+    """The closed hand holds nothing: its fingers are together open by at most 0.01, or its suction cup did not seal."""
     START_COLLISION = "start-collision"
     """The hand was in collision at the very first step."""
     WRONG_PART = "wrong-part"
@@ -67,7 +67,7 @@ class OutcomeKind(StrEnum):
 
     @property
     def is_valid(self) -> bool:
-        """Whether the primitive ran to its end: what it closed its fingers on was held, and no contact was refused."""
+        """Whether the primitive ran to its end: what the hand closed on was held, and no contact was refused."""
         return self in (OutcomeKind.OK, OutcomeKind.NO_CONTACT)
 
 
@@ -218,7 +218,8 @@ class Outcome:
     displacement: Float = field(default_factory=lambda: np.full(3, np.nan))
     """[3], world frame, of the touched point of the target part."""
     grasp_opening: float = float("nan")
-    """How far both fingers together stayed open when they had closed, m, of primitives that close them; else NaN."""
+    """How far both fingers together stayed open when they had closed, m, of primitives that close them; else NaN. Of a
+    suction cup its diameter where it sealed, and 0 where it did not."""
     steps: int = 0
     """Physics steps simulated."""
 

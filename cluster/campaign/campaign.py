@@ -145,7 +145,9 @@ class Campaign:
         catalogue, folder = objects_for(task, config, built_in, per_category, config.seed, lists)
         parts = split_as_told((entry.ref for entry in catalogue.usable), config.splits, config.seed)
         if config.start_from is not None:
-            fit_to_start_from(config.start_from, config.task).check_camera(config.collection.camera)
+            policy = fit_to_start_from(config.start_from, config.task)
+            policy.check_camera(config.collection.camera)
+            policy.warn_of_other_hand(config.collection.gripper)
             seen = seen_by(config.start_from)
             if not seen:
                 self._console.print(f"start_from {unknown(config.start_from)}")

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shared.config import CollectionConfig, parse
+from shared.config import PANDA, CollectionConfig, parse
 from shared.errors import UsageError
 from shared.extras import require, require_packages
 from shared.policies.methods import BASELINES
@@ -73,7 +73,9 @@ def train(
         return run_stage(job, config, used)
 
 
-def simulated(objects: str | Path, task: str, seed: int = 1, arm: str | None = None) -> Iterator["SimEnvironment"]:
+def simulated(
+    objects: str | Path, task: str, seed: int = 1, gripper: str = PANDA, arm: str | None = None
+) -> Iterator["SimEnvironment"]:
     """Simulated objects at rest and in view, one after the other, each with hidden dynamics that are drawn for it.
 
     Each is an `Environment`, like a robot in front of an object; its `object.ref.id` says which object it is. Every
@@ -83,15 +85,16 @@ def simulated(objects: str | Path, task: str, seed: int = 1, arm: str | None = N
         objects: a folder of objects in PartNet-Mobility's layout.
         task: a name or a TOML file, as for `adaafford collect`; objects that it does not apply to are left out.
         seed: everything random derives from it.
+        gripper: the hand, as `collection.gripper` names it.
         arm: that carries the hand, as for `adaafford collect --collection.arm`; None: the hand flies.
 
     Raises:
-        UsageError: there is no such task or arm, or no object that it applies to comes to rest in view of the camera.
+        UsageError: there is no such task, hand or arm, or no object of the task comes to rest in view of the camera.
     """
     require("adaafford.simulated", "collect", without=("ray",))
     from collector.simulated_objects import SimulatedObjects
 
-    found = SimulatedObjects(Path(objects), task_of(task), CollectionConfig(arm=arm))
+    found = SimulatedObjects(Path(objects), task_of(task), CollectionConfig(gripper=gripper, arm=arm))
     plan, first = found.plan(seed), 0
     while True:
         start = found.start(plan, first)

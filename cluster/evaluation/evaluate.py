@@ -87,6 +87,7 @@ class Evaluation:
             files = self.policies(version)
             policy = Policy.from_files(files)
             policy.check_camera(self.store.setting.collection.camera)
+            policy.warn_of_other_hand(self.store.setting.collection.gripper)
             for name in self.config.methods:
                 if METHODS.get(name).policy_version(self.version) == version:
                     policy.require(*METHODS.get(name).modules)

@@ -20,7 +20,7 @@ from cluster.runs.run_folder import RunFolder, find
 from cluster.runs.warm_start import folder_of, seen_by, unknown
 from cluster.workers.session import CurrentWorkerGroup, worker_groups
 from collector.setting import in_fidelity_of, make_setting
-from shared.config import CollectionConfig
+from shared.config import PANDA, CollectionConfig
 from shared.errors import UsageError
 from shared.io.text import plain
 from shared.plan import EvaluationConfig, ObjectRef, Setting
@@ -135,13 +135,15 @@ def evaluate_without_run(source: str, settings: EvaluateSettings, out: Path | No
     if not (seen := seen_by(source)):
         Console(file=sys.stderr, highlight=False).print(f"policy {unknown(source)}", markup=False, soft_wrap=True)
     refs, folder = _objects(task, settings, settings.objects, lambda ref: ref.content_hash not in seen)
-    needs_depth, files = policy.config.pinch_profile, policy.to_files()
+    needs_depth, files, collection = policy.config.pinch_profile, policy.to_files(), settings.collection
+    if collection.gripper == PANDA:  # The default, which gives way to the hand that the policy knows.
+        collection = collection.model_copy(update={"gripper": policy.gripper})
     subject = _Subject(
         policy=policy,
         files=lambda version: files,
         version=ONLY_VERSION,
         methods=methods,
-        collection=settings.collection.keeping_depth() if needs_depth else settings.collection,
+        collection=collection.keeping_depth() if needs_depth else collection,
         oracle=place,
         root=None,
         evaluations=EVALUATIONS,

@@ -11,7 +11,7 @@ from cluster.runs.run_folder import RunFolder
 from cluster.runs.warm_start import seen_by
 from learner.alternation import trained_in
 from learner.stages.jobs import DONE_FILE, objects_seen, read_policy_folder
-from shared.config import CameraConfig
+from shared.config import PANDA, CollectionConfig
 from shared.errors import UsageError
 from shared.io.files import make_folder, read_bounded, write_atomically
 from shared.io.text import markdown
@@ -115,12 +115,11 @@ def export(source: Source, licence: str) -> dict[str, bytes]:
     """
     policy = source.policy.without_baselines()
     files = policy.to_files(half=True)
-    camera = source.store.setting.collection.camera
     card = (
         head(policy, files, licence),
         _data(source),
         f"## Results\n\n{source.results}",
-        _limits(camera),
+        _limits(source.store.setting.collection),
         _use(policy),
     )
     seen = {"stage": "exported", "objects": sorted(source.known)}
@@ -181,10 +180,13 @@ clouds of {setting.collection.camera.points} points; {source.origin}: {source.ob
 `{source.store.digest()[:16]}`."""
 
 
-def _limits(camera: CameraConfig) -> str:
+def _limits(collection: CollectionConfig) -> str:
+    camera = collection.camera
+    hand = "Panda hand" if collection.gripper == PANDA else f"hand `{collection.gripper}`"
+    depth = f"depth with {camera.noise:g} times the errors of a camera" if camera.noise else "noise-free depth"
     return f"""## Limits
 
-- Trained in simulation alone: rigid parts, one hinge or slide at a time, a flying Panda hand, noise-free depth.
+- Trained in simulation alone: rigid parts, one hinge or slide at a time, a flying {hand}, {depth}.
 - The object stands upright and alone in the cloud, in metres, of about the size that the training objects have (they
   fit into a ball of radius 1), seen from {camera.elevation_deg.low:g} to {camera.elevation_deg.high:g} deg above.
 - What is called a probability is one on objects like those of training, and on no others.

@@ -12,9 +12,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from adaafford.scans import Scan, estimated_normals, npz_of
+from adaafford.scans import Scan, npz_of
 from shared.errors import UsageError
 from shared.io.files import create_exclusively, write_atomically
+from shared.observation import estimated_normals
 from shared.types import Float
 
 WORKING_POINTS = 100_000

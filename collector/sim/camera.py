@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from collector.objects.articulation import ArticulatedObject, Body
 from shared.config import CameraConfig
 from shared.depth import DepthMap
-from shared.observation import furthest_first, round_normals, round_points
+from shared.observation import estimated_normals, facing, furthest_first, round_normals, round_points
 from shared.types import Float, Observation
 
 NEAR, FAR = 0.1, 100.0
@@ -209,6 +209,8 @@ def observation_from(
 ) -> Observation | None:
     """The cloud that is kept of an image, in furthest-point order; None where no pixel sees the object.
 
+    Of an image with errors the normals are estimated.
+
     Args:
         image: what the camera saw.
         world_from_camera: [4, 4], where it stood.
@@ -220,13 +222,15 @@ def observation_from(
         return None
     # A small object fills few pixels: then every one is kept, and some stand twice.
     kept = furthest_first(image.points, config.points, config.candidates, rng)
-    bodies = image.bodies[kept]
+    bodies, points, normals = image.bodies[kept], image.points[kept], image.normals[kept]
+    if config.noise:
+        normals = facing(estimated_normals(image.points, points), points, world_from_camera[:3, 3])
     dense = None
     if config.keep_depth:
         dense = DepthMap.of(image.pixels, image.depths, config.image_size, focal_length(config), world_from_camera)
     return Observation(
-        points=round_points(image.points[kept]),
-        normals=round_normals(image.normals[kept]),
+        points=round_points(points),
+        normals=round_normals(normals),
         part_ids=bodies,
         movable=np.isin(bodies, np.array(qualifying, dtype=np.uint8)),
         pixels=image.pixels[kept],

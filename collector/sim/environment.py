@@ -7,6 +7,7 @@ import numpy as np
 from collector.objects.articulation import ArticulatedObject, joint_twist
 from collector.objects.catalogue import qualifying_parts
 from collector.sim.camera import Camera, EmbreeCamera, observation_from
+from collector.sim.depth_noise import noisy
 from collector.sim.sapien_camera import SapienCamera
 from collector.sim.scene import Scene
 from collector.sim.simulator import PrivilegedState, SimEnvironment
@@ -61,7 +62,7 @@ class SapienEnvironment:
             self.scene = Scene(target, dynamics, self._fidelity, self._spec, collection.gripper)
         self._camera_config = collection.camera
         self._camera = camera_for(target, world_from_camera, self._camera_config)
-        self._rng = rng
+        self._rng, self._errors = rng, rng.spawn(1)[0]  # What is drawn from one does not depend on the other.
         self._observed: Observation | None = None
         self._known: list[tuple[Float, Observation]] = []
         self._restricted = dynamics.direction is Direction.AS_BUILT
@@ -131,8 +132,11 @@ class SapienEnvironment:
         return PrivilegedState(self.scene.joint_positions(), self.scene.limits.copy(), twist)
 
     def _look(self, positions: Float) -> Observation:
+        config, pose = self._camera_config, self._camera.world_from_camera
         image = self._camera.capture(positions)
-        seen = observation_from(image, self._camera.world_from_camera, self.parts, self._camera_config, self._rng)
+        if config.noise:
+            image = noisy(image, config.image_size, pose[:3, 3], config.noise, self._errors)
+        seen = observation_from(image, pose, self.parts, config, self._rng)
         if seen is None:
             raise LookupError(f"no pixel sees object {self.object.ref.id}")
         if len(self.parts) > 1 and seen.movable.any():

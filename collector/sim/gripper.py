@@ -90,6 +90,13 @@ class Gripper(Protocol):
         """Whether the closed hand may hold something."""
         ...
 
+    def attached(self) -> bool:
+        """Whether it is fastened to the object by more than contact, as by vacuum.
+
+        Asked after every step once the hand has closed; a hand that cannot bear its load lets go here.
+        """
+        ...
+
     def coordinates(self) -> Float:
         """Everything that moves in the hand, lengths and rad or less: if none of it changes, the hand is at rest."""
         ...
@@ -124,6 +131,29 @@ def convex(vertices: list[tuple[float, float, float]]) -> Mesh:
     return Mesh(np.array(vertices), np.zeros((0, 3), dtype=np.int32))
 
 
+class HandShape(Protocol):
+    """The shapes and figures of a hand that can be built to fly in either way."""
+
+    @property
+    def palm(self) -> tuple[Mesh, ...]:
+        """Convex pieces, hand frame."""
+        ...
+
+    @property
+    def palm_mass(self) -> float:
+        """In kg. The drives are strongly overdamped, so that masses hardly matter."""
+        ...
+
+    @property
+    def finger_open(self) -> float:
+        """How far each finger opens, m; 0 where none does."""
+        ...
+
+    def add_fingers(self, assembly: Assembly, hand: Link) -> tuple[Link, ...]:
+        """Add the fingers to the palm's link; drives of those that open have no strength until `set_finger_pace`."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class TwoFingers:
     """The shapes and figures of a hand with two fingers that slide apart along its frame's left.
@@ -145,7 +175,7 @@ class TwoFingers:
     finger_mass: float
 
     def add_fingers(self, assembly: Assembly, hand: Link) -> tuple[Link, Link]:
-        """Add the fingers to the palm's link; their drives have no strength until `set_finger_pace`."""
+        """See `HandShape.add_fingers`."""
         left, right = (self._add_finger(assembly, hand, *named) for named in (("left", 1.0), ("right", -1.0)))
         return left, right
 
@@ -171,13 +201,14 @@ class FreeGripper:
     Args:
         shape: of the hand.
         palm: the palm's link, root of an articulation.
-        fingers: the two fingers' links.
+        fingers: the fingers' links.
     """
 
-    def __init__(self, shape: TwoFingers, palm: Link, fingers: tuple[Link, Link]) -> None:
+    def __init__(self, shape: HandShape, palm: Link, fingers: tuple[Link, ...]) -> None:
         self.palm, self.fingers = palm, fingers
         self._open = shape.finger_open
         self._articulation = palm.articulation
+        self._still = np.zeros(self._articulation.dof, dtype=np.float32)
         self._drive = physx.PhysxDriveComponent(palm)
         palm.entity.add_component(self._drive)
         self._rotation, self._origin = np.eye(3), np.zeros(3)
@@ -200,7 +231,7 @@ class FreeGripper:
         self._drive.pose_in_parent = pose(frame(rotation, position))
         self.drive(still())
         self.drive_velocity(still())
-        self._articulation.set_qpos(np.full(2, opening, dtype=np.float32))
+        self._articulation.set_qpos(np.full_like(self._still, opening))
         drive_fingers(self.fingers, opening)
         self.shift(still(), still())
 
@@ -210,7 +241,7 @@ class FreeGripper:
         self._articulation.set_root_pose(pose(frame(turned, self._origin + self._rotation @ place[:3])))
         self._articulation.set_root_linear_velocity(self._rotation @ velocity[:3])
         self._articulation.set_root_angular_velocity(self._rotation[:, 2] * velocity[3])
-        self._articulation.set_qvel(np.zeros(2, dtype=np.float32))
+        self._articulation.set_qvel(self._still)
 
     def displacement(self) -> Float:
         """See `Gripper.displacement`."""
@@ -237,6 +268,10 @@ class FreeGripper:
         """See `Gripper.holds`."""
         return self.opening() > GRASP_OPENING
 
+    def attached(self) -> bool:
+        """See `Gripper.attached`: fingers only touch."""
+        return False
+
     def coordinates(self) -> Float:
         """See `Gripper.coordinates`: palm position, its quaternion, the fingers."""
         at = self._articulation.get_root_pose()
@@ -249,7 +284,7 @@ def _turn(angle: float) -> Float:
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
-def build_free(shape: TwoFingers, scene: sapien.Scene, material: physx.PhysxMaterial) -> FreeGripper:
+def build_free(shape: HandShape, scene: sapien.Scene, material: physx.PhysxMaterial) -> FreeGripper:
     """Build a free hand into a scene, weightless, as the published gravity compensation makes it."""
     assembly = Assembly(material)
     hand = assembly.add(None, "palm", shape.palm, joint="undefined", touches_own_kind=False)
@@ -259,15 +294,20 @@ def build_free(shape: TwoFingers, scene: sapien.Scene, material: physx.PhysxMate
     return FreeGripper(shape, hand, fingers)
 
 
-def set_finger_pace(fingers: tuple[Link, Link], pace: float) -> None:
+def _opening(fingers: tuple[Link, ...]) -> list[Link]:
+    """Those of the fingers that open."""
+    return [link for link in fingers if link.joint.type == "prismatic"]
+
+
+def set_finger_pace(fingers: tuple[Link, ...], pace: float) -> None:
     """See `Gripper.set_pace`."""
-    for link in fingers:
+    for link in _opening(fingers):
         link.joint.set_drive_property(FINGER_STIFFNESS, FINGER_DAMPING / pace)
 
 
-def drive_fingers(fingers: tuple[Link, Link], opening: float) -> None:
-    """Drive each finger to `opening`."""
-    for link in fingers:
+def drive_fingers(fingers: tuple[Link, ...], opening: float) -> None:
+    """Drive each finger that opens to `opening`."""
+    for link in _opening(fingers):
         link.joint.set_drive_target(opening)
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from collector.sim.engine import physx, sapien
 from collector.sim.gripper import Gripper, GripperSpec, TwoFingers, build_free, convex
 from collector.sim.jointed_gripper import build_jointed
+from collector.sim.suction import build_suction
 from shared.extensions import Registry
 
 
@@ -38,4 +39,6 @@ def panda_shape() -> TwoFingers:
     return TwoFingers((convex(flange + body + top),), (convex(finger),), 0.0584, 0.04, 0.73, 0.015)
 
 
-GRIPPERS = Registry("gripper", GripperSpec, {"panda": two_fingered(panda_shape())})
+GRIPPERS = Registry(
+    "gripper", GripperSpec, {"panda": two_fingered(panda_shape()), "suction": GripperSpec(build_suction)}
+)

@@ -11,7 +11,7 @@ from collector.sim.gripper import (
     ARM_DAMPING,
     ARM_STIFFNESS,
     GRASP_OPENING,
-    TwoFingers,
+    HandShape,
     drive_fingers,
     frame,
     make_weightless,
@@ -30,23 +30,24 @@ class JointedGripper:
 
     Args:
         shape: of the hand.
-        articulation: six joints of the carrier (x, y, z, then turns about x, y, z), then the two fingers.
+        articulation: six joints of the carrier (x, y, z, then turns about x, y, z), then those of fingers that
+            open.
         palm: the palm's link.
-        fingers: the two fingers' links.
+        fingers: the fingers' links.
 
     Attributes:
-        joints: the same eight joints.
+        joints: the same joints.
     """
 
     def __init__(
-        self, shape: TwoFingers, articulation: physx.PhysxArticulation, palm: Link, fingers: tuple[Link, Link]
+        self, shape: HandShape, articulation: physx.PhysxArticulation, palm: Link, fingers: tuple[Link, ...]
     ) -> None:
         self._open = shape.finger_open
         self.articulation = articulation
         self.joints = tuple(articulation.active_joints)
         self._driven = [self.joints[k] for k in DRIVEN]
         self.palm, self.fingers = palm, fingers
-        assert [j.name for j in self.joints[6:]] == ["finger-left", "finger-right"], "joint order is by creation"
+        assert all(j.name.startswith("finger-") for j in self.joints[6:]), "joint order is by creation"
 
     def set_pace(self, pace: float) -> None:
         """See `Gripper.set_pace`."""
@@ -57,16 +58,17 @@ class JointedGripper:
     def place(self, rotation: Float, position: Float, *, opened: bool) -> None:
         """See `Gripper.place`."""
         self.articulation.set_root_pose(pose(frame(rotation, position)))
-        positions = np.array([0.0] * 6 + [self._open if opened else 0.0] * 2, dtype=np.float32)
+        positions = np.array([0.0] * 6 + [self._open if opened else 0.0] * (len(self.joints) - 6), dtype=np.float32)
         self.articulation.set_qpos(positions)
-        self.articulation.set_qvel(np.zeros(8, dtype=np.float32))
+        self.articulation.set_qvel(np.zeros_like(positions))
         for joint, target in zip(self.joints, positions, strict=True):
             joint.set_drive_target(float(target))
             joint.set_drive_velocity_target(0.0)
 
     def shift(self, place: Float, velocity: Float) -> None:
         """See `Gripper.shift`."""
-        positions, velocities = self.articulation.get_qpos(), np.zeros(8, dtype=np.float32)
+        positions = self.articulation.get_qpos()
+        velocities = np.zeros_like(positions)
         positions[:6] = on_arm(place)
         velocities[:6] = on_arm(velocity)
         self.articulation.set_qpos(positions)
@@ -98,8 +100,12 @@ class JointedGripper:
         """See `Gripper.holds`."""
         return self.opening() > GRASP_OPENING
 
+    def attached(self) -> bool:
+        """See `Gripper.attached`: fingers only touch."""
+        return False
+
     def coordinates(self) -> Float:
-        """See `Gripper.coordinates`: the positions of the eight joints."""
+        """See `Gripper.coordinates`: the positions of the joints."""
         return np.asarray(self.articulation.get_qpos(), dtype=np.float64)
 
 
@@ -110,7 +116,7 @@ def on_arm(place: Float) -> Float:
     return arm
 
 
-def build_jointed(shape: TwoFingers, scene: sapien.Scene, material: physx.PhysxMaterial) -> JointedGripper:
+def build_jointed(shape: HandShape, scene: sapien.Scene, material: physx.PhysxMaterial) -> JointedGripper:
     """Build the published hand into a scene; see `collector.sim.gripper.build_free`."""
     assembly = Assembly(material)
     link = assembly.add(None, "hand-root", ())

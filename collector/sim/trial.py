@@ -73,7 +73,9 @@ class Trial:
         self._brushed = False
         self._timing = fidelity.approach
         self._clearance = 0.0
+        self._closed = False
         self._grasps = False
+        self._attached = False
         self._positions = np.full(1, np.nan)
         self._stood: tuple[int, Float] | None = None
         self._hand_at = still()
@@ -117,6 +119,7 @@ class Trial:
         self._hold(last=then is None)
         if self.primitive.closes_fingers:
             gripper.close()
+            self._closed = True
             self._hold(closing=True)
             self._opening = gripper.opening()
             if not gripper.holds():
@@ -144,6 +147,7 @@ class Trial:
                 raise _TrialEndedError(self._kind())
             if (
                 self.fidelity.skip_free_flight
+                and not self._attached
                 and (rests or not self._checked)
                 and (skipped := self._free_flight(path, step))
             ):
@@ -223,7 +227,7 @@ class Trial:
             opening, opened = self.scene.gripper.opening() if closing else 0.0, opening
             if step and self._came_to_rest(now - before, last) and self._stays_open(opened, opening, steps - step):
                 return
-            if last and self._object_rests() and self.scene.contact().clearance > CLEARANCE:
+            if last and not self._attached and self._object_rests() and self.scene.contact().clearance > CLEARANCE:
                 return
             before = now
 
@@ -245,6 +249,9 @@ class Trial:
             self.scene.set_timing(FIRST_STEP)
         self.scene.system.step()
         self.steps += 1
+        if self._closed:
+            self._attached = self.scene.gripper.attached()
+            self._brushed = self._brushed or self._attached
         if not self._checked:
             self._check_first_contact()
         if first:
@@ -269,7 +276,7 @@ class Trial:
                 raise _TrialEndedError(OutcomeKind.HAND_CONTACT)
             if self.primitive.checks_contact and contact.finger_on - {self.target}:
                 raise _TrialEndedError(OutcomeKind.WRONG_PART)
-        self._checked = contact.presses or (not self.primitive.checks_contact and contact.brushes)
+        self._checked = contact.presses or (not self.primitive.checks_contact and self._brushed)
 
     def _succeeded(self, start: float, end: float, displacement: Float) -> bool:
         low, high = self.scene.limits[self.target - 1]

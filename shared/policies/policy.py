@@ -1,6 +1,7 @@
 """Policies: the networks of one task as they are trained, published, pulled by actors and carried to a robot."""
 
 import hashlib
+import logging
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
@@ -10,7 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from shared.config import CameraConfig, StrictModel
+from shared.config import PANDA, CameraConfig, Name, StrictModel
 from shared.errors import StoreError, UsageError
 from shared.io.documents import parse_document, parse_object
 from shared.io.text import MAX_WORD, plain
@@ -19,6 +20,8 @@ from shared.networks.aip import Aip
 from shared.networks.network_config import NetworkConfig
 from shared.networks.prior import Prior
 from shared.policies.methods import BASELINES, BaselineName, ModuleName
+
+logger = logging.getLogger(__name__)
 
 WEIGHTS_FILE = "weights.safetensors"
 POLICY_FILE = "policy.json"
@@ -41,6 +44,7 @@ class PolicyDocument(StrictModel):
     format: Literal["adaafford-policy"] = "adaafford-policy"
     schema_version: int = POLICY_SCHEMA
     task: str = Field(max_length=100)
+    gripper: Name = Field(PANDA, exclude_if=lambda name: name == PANDA)
     network: NetworkConfig
     trained: tuple[ModuleName, ...] = Field(max_length=100)
     weights_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
@@ -54,6 +58,7 @@ class Policy:
 
     Attributes:
         task: name of the task that they were trained for.
+        gripper: name of the hand whose interactions they were trained on.
         config: sizes of the networks.
         prior: Where2Act.
         aap: Adaptive Affordance Prediction.
@@ -66,8 +71,10 @@ class Policy:
         >>> adapter = Adapter(policy)
     """
 
-    def __init__(self, task: str, config: NetworkConfig, trained: frozenset[ModuleName] = frozenset()) -> None:
-        self.task = task
+    def __init__(
+        self, task: str, config: NetworkConfig, trained: frozenset[ModuleName] = frozenset(), gripper: str = PANDA
+    ) -> None:
+        self.task, self.gripper = task, gripper
         self.config = config
         self.trained = trained
         self.prior = Prior(config)
@@ -111,7 +118,7 @@ class Policy:
             seed: of the other weights of the profiles' encoders.
         """
         config = self.config.model_copy(update={"pinch_profile": profile, "roll_symmetry": symmetry})
-        begun = Policy.untrained(self.task, config, seed)
+        begun = Policy.untrained(self.task, config, seed).of_hand(self.gripper)
         weights, known = begun.modules().state_dict(), self.without_baselines().modules().state_dict()
         for name, weight in weights.items():
             if name in known:
@@ -127,7 +134,7 @@ class Policy:
     def without_baselines(self) -> "Policy":
         """A policy of the same prior, AAP and AIP, and of nothing that only an evaluation asks for."""
         with torch.device("meta"):
-            kept = Policy(self.task, self.config, self.trained.intersection(CORE))
+            kept = Policy(self.task, self.config, self.trained.intersection(CORE), self.gripper)
         kept.prior, kept.aap, kept.aip = self.prior, self.aap, self.aip
         return kept
 
@@ -135,6 +142,20 @@ class Policy:
         """This policy, with `name` counted among the trained modules from here on."""
         self.trained |= {name}
         return self
+
+    def of_hand(self, gripper: str) -> "Policy":
+        """This policy, with `gripper` as the hand that it is trained with from here on."""
+        self.gripper = gripper
+        return self
+
+    def warn_of_other_hand(self, gripper: str) -> None:
+        """Warn if interactions with `gripper` are not what the networks were trained on."""
+        if self.gripper != gripper:
+            logger.warning(
+                "the policy was trained with the hand '%s', and is used with the hand '%s', of which it knows nothing",
+                self.gripper,
+                gripper,
+            )
 
     def check_camera(self, camera: CameraConfig) -> None:
         """Check that a camera keeps what the networks are told.
@@ -174,6 +195,7 @@ class Policy:
         weights = save(_halved(tensors) if half else tensors)
         document = PolicyDocument(
             task=self.task,
+            gripper=self.gripper,
             network=self.config,
             trained=tuple(sorted(self.trained)),
             weights_sha256=hashlib.sha256(weights).hexdigest(),
@@ -199,7 +221,7 @@ class Policy:
             raise StoreError(f"policy: has the network '{unknown[0]}'; install the package that adds this baseline")
         # On the meta device nothing is allocated, so that absurd sizes cost nothing before they are refused.
         with torch.device("meta"):
-            policy = cls(document.task, document.network, frozenset(document.trained))
+            policy = cls(document.task, document.network, frozenset(document.trained), document.gripper)
         modules = policy.modules()
         parameters = sum(tensor.numel() for tensor in modules.state_dict().values())
         if parameters > MAX_PARAMETERS:

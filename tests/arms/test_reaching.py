@@ -204,7 +204,7 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_a_collection_with_an_arm_has_one_digest_for_any_number_of_workers(objects: Path, tmp_path: Path) -> None:
     more = {"collection.arm": "panda"}
-    stores = [collected(tmp_path / f"{n}", objects, n, ROLLOUTS // max(n, 1), more) for n in (0, 2)]
+    stores = [collected(tmp_path / f"{n}", objects, n, ROLLOUTS // max(n, 1), **more) for n in (0, 2)]
     assert stores[0].digest() == stores[1].digest()
     rows = stores[0].interactions(["outcome", "motion", "steps"]).to_pylist()
     out = [row for row in rows if row["outcome"] == "unreachable"]

@@ -297,6 +297,21 @@ def test_evaluate_policy_keeps_depth_images_where_its_networks_need_them(
     assert told[1].collection == told[0].collection.keeping_depth()
 
 
+def test_evaluate_policy_has_the_hand_of_the_policy_unless_another_is_named(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda subject, *_: told.append(subject))
+    policy = Policy.untrained("push", SMALL_NETWORK, 0).with_trained("prior").of_hand("suction")
+    for name, data in policy.to_files().items():
+        (tmp_path / name).write_bytes(data)
+    for hand in ("panda", "suction", "wide"):
+        collection = FAST.collection.model_copy(update={"gripper": hand})
+        settings = FAST.model_copy(update={"objects": finished / "objects", "collection": collection})
+        evaluate_without_run(str(tmp_path), settings, None)
+    assert [subject.collection.gripper for subject in told] == ["suction", "suction", "wide"]
+
+
 def test_evaluate_policy_with_a_run_is_the_evaluation_of_the_run(
     finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,9 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -49,11 +47,9 @@ def fresh(objects: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
     return collected(tmp_path_factory.mktemp("fresh") / "store", objects, workers=0, per_shard=ROLLOUTS)
 
 
-def collected(
-    path: Path, objects: Path, workers: int, per_shard: int, more: Mapping[str, object] = MappingProxyType({})
-) -> Store:
+def collected(path: Path, objects: Path, workers: int, per_shard: int, **more: object) -> Store:
     """The store of `adaafford collect` in a process of its own."""
-    flags = FLAGS | more | {"objects": objects, "store": path, "workers": workers, "per-shard": per_shard}
+    flags = FLAGS | {"objects": objects, "store": path, "workers": workers, "per-shard": per_shard} | more
     words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
     program = "import sys; from cluster.cli.main import main; main()"
     subprocess.run([sys.executable, "-c", program, "collect", *words], check=True, capture_output=True)
@@ -107,6 +103,14 @@ def test_the_number_of_workers_does_not_matter(
     fresh: Store, objects: Path, tmp_path: Path, workers: int, per_shard: int
 ) -> None:
     assert collected(tmp_path / "store", objects, workers, per_shard).digest() == fresh.digest()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_suction_cup_and_the_errors_of_a_camera_are_the_same_for_any_worker(objects: Path, tmp_path: Path) -> None:
+    more = {"collection.gripper": "suction", "collection.camera.noise": 1.0}
+    one, two = (collected(tmp_path / str(n), objects, n, 2, **more).digest() for n in (0, 2))
+    assert one == two
 
 
 def test_another_seed_gives_another_digest(fresh: Store, objects: Path, tmp_path: Path) -> None:

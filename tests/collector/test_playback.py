@@ -78,6 +78,8 @@ def test_a_film_is_written_with_a_caption_a_primitive(tmp_path: Path, monkeypatc
     (caption,) = film.film(door(), ["push-left"], 1, out)
     assert caption.startswith("push-left: ok, success, m = ")
     assert out.read_bytes().startswith(b"\x89PNG")
+    (caption,) = film.film(door(), ["pull"], 1, out, "suction")
+    assert caption.startswith("pull: ok")
     with pytest.raises(UsageError, match="unknown primitive 'Shove!'; allowed: push, push-left"):
         film.film(door(), ["push", "Shove!"], 1, out)
     (tmp_path / "file").write_text("no folder")

@@ -389,7 +389,7 @@ def test_what_has_the_default_hand_and_simulator_is_written_as_before_these_had_
             {"primitive": "shove"},
             "unknown primitive 'shove'; allowed: push, push-left, push-up, pull, pull-left, pull-up",
         ),
-        ({"gripper": "claw"}, "unknown gripper 'claw'; allowed: panda"),
+        ({"gripper": "claw"}, "unknown gripper 'claw'; allowed: panda, suction"),
         ({"simulator": "dream"}, "unknown simulator 'dream'; allowed: sapien"),
     ],
 )

@@ -31,7 +31,7 @@ from learner.training.loop import CHECKPOINT_FILE
 from shared.errors import UsageError, WorkerError
 from shared.io.files import exclusive_lock
 from shared.io.redaction import without_places
-from shared.plan import Job
+from shared.plan import Job, Plan
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.progress import Progress
 from shared.store.snapshot import Snapshot
@@ -439,3 +439,22 @@ def test_a_second_learner_in_the_same_folder_is_refused(
         assert run(told) == 2
     assert "is in use by process" in capsys.readouterr().err
     assert not (out / WEIGHTS_FILE).exists()
+
+
+@pytest.mark.slow
+def test_a_policy_is_of_the_hand_of_the_store_that_it_was_trained_from_last(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = fabricated_plan()
+    setting = plan.setting
+    collection = setting.collection.model_copy(update={"gripper": "suction"})
+    suction = Plan(setting=setting.model_copy(update={"collection": collection}))
+    for name, of in (("panda", plan), ("suction", suction)):
+        make_store(tmp_path / name, plan=of)
+    first = run_stage(StageJob("prior", tmp_path / "panda", tmp_path / "first"), FAST)
+    assert first.gripper == "panda"
+    capsys.readouterr()
+    tuned = run_stage(StageJob("prior", tmp_path / "suction", tmp_path / "tuned", tmp_path / "first"), FAST)
+    assert tuned.gripper == "suction"
+    assert "was trained with the hand 'panda'; it is now trained with 'suction'" in capsys.readouterr().out
+    assert read_policy_folder(tmp_path / "tuned").gripper == "suction"

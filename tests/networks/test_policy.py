@@ -31,6 +31,23 @@ def test_a_policy_comes_back_bit_for_bit(files: dict[str, bytes]) -> None:
     assert policy.to_files() == files
 
 
+def test_a_policy_records_the_hand_of_its_training_and_warns_of_another(
+    files: dict[str, bytes], caplog: pytest.LogCaptureFixture
+) -> None:
+    panda = Policy.from_files(files)
+    assert panda.gripper == "panda" and "gripper" not in json.loads(files[POLICY_FILE])
+    suction = Policy.untrained("push", TINY, seed=3).of_hand("suction").with_pinch(True, False, 1)
+    read = Policy.from_files(suction.without_baselines().to_files())
+    assert read.gripper == "suction"
+    for policy in (panda, read):
+        policy.warn_of_other_hand(policy.gripper)
+    assert not caplog.records
+    read.warn_of_other_hand("panda")
+    assert caplog.messages == [
+        "the policy was trained with the hand 'suction', and is used with the hand 'panda', of which it knows nothing"
+    ]
+
+
 def test_first_weights_depend_on_the_seed_alone() -> None:
     torch.manual_seed(0)
     state = torch.random.get_rng_state()

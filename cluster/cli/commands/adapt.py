@@ -45,7 +45,8 @@ class AdaptCommand:
     kind: OutcomeKind = OutcomeKind.UNKNOWN
     """How that interaction ended, such as "ok", "no-contact" or "no-grasp"."""
     grasp_width: float | None = None
-    """Opening of the two fingers together after they closed in that interaction, m."""
+    """Opening of the two fingers together after they closed in that interaction, m; of a suction cup its diameter if it
+    sealed, else 0."""
     interaction: int | None = None
     """Number of the interaction that --outcome is of, as an answer names it: a call that is repeated counts it once."""
     success: bool | None = None

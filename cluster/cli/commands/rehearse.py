@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from cluster.config.flags import parse_flags
+from shared.config import MAX_NOISE, PANDA
 from shared.errors import UsageError
 from shared.extras import require
 from shared.io.files import make_folder
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from shared.policies.policy import Policy
 
 BUILT_IN_PER_CATEGORY = 4
-MAX_ROLLOUTS, MAX_NOISE = 1000, 10.0
+MAX_ROLLOUTS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,17 +88,17 @@ def main(args: list[str]) -> int:
         raise UsageError(f"--seed {command.seed}: needs a number that is not negative")
     require("adaafford rehearse", "collect", without=("ray",))
     if command.policy is None:
-        return _follow(next(_robots(command)))
+        return _follow(next(_robots(command, PANDA)))
     from adaafford.pretrained import load_policy
 
     policy = load_policy(command.policy)
-    ended = [_played(command, robot, policy) for robot in _robots(command)]
+    ended = [_played(command, robot, policy) for robot in _robots(command, policy.gripper)]
     print(_summary(command, ended))
     return 0
 
 
-def _robots(command: RehearseCommand) -> Iterator["SimulatedRobot"]:
-    """The robots of the command, each made when it is its turn."""
+def _robots(command: RehearseCommand, gripper: str) -> Iterator["SimulatedRobot"]:
+    """The robots of the command, with this hand, each made when it is its turn."""
     from cluster.cli.library import simulated
     from cluster.config.objects import built_in_categories
     from cluster.evaluation.rehearsal import Setting, SimulatedRobot
@@ -109,7 +110,7 @@ def _robots(command: RehearseCommand) -> Iterator["SimulatedRobot"]:
     if objects is None:
         objects = command.folder / "objects"
         generate(objects, dict.fromkeys(built_in_categories(task_of(command.task), ()), BUILT_IN_PER_CATEGORY), 1)
-    found = simulated(objects, command.task, command.seed, command.arm)
+    found = simulated(objects, command.task, command.seed, gripper, command.arm)
     for number, environment in enumerate(islice(found, command.rollouts)):
         folder = command.folder if command.rollouts == 1 else command.folder / f"{number + 1:04d}"
         make_folder(folder)
