@@ -31,7 +31,7 @@ class SapienEnvironment:
 
     All interactions of a rollout are on one part, because z describes how one door or switch moves. The part is drawn
     from those that the first observation shows and the task allows, in proportion to its visible points. Where there is
-    a latch, a door and its handles are one target (see `collector.sim.mechanisms.Holds`).
+    a latch, a door and its handles are one target, as far as the task allows them (`collector.sim.mechanisms.Holds`).
 
     Args:
         target: the object.
@@ -140,7 +140,8 @@ class SapienEnvironment:
         if not self._chosen and seen.movable.any():
             several = len(self.parts) > 1
             part = int(self._rng.choice(seen.part_ids[seen.movable])) if several else self.parts[0]
-            self.parts, self._chosen = self.scene.holds.target_of(part), True
+            together = self.scene.holds.target_of(part)
+            self.parts, self._chosen = tuple(k for k in self.parts if k in together), True
             seen = replace(seen, movable=np.isin(seen.part_ids, self.parts))
         return seen
 

@@ -10,7 +10,7 @@ from collector.objects.procedural.assembly import hinged, sliding
 from collector.objects.procedural.cabinets import GAP
 from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box
 
-PRESS, PULL_OUT = 0.014, 0.03
+PRESS, PULL_OUT = 0.012, 0.03
 """How far a button goes in, and how far a handle comes out."""
 TILT = 0.12
 """rad: how far a paddle tilts."""
@@ -19,10 +19,10 @@ PLATE = 0.04
 
 
 def random_button_cabinet(rng: np.random.Generator) -> ObjectModel:
-    """A door without any grip, and beside it a panel with two to four buttons, or paddles that tilt inward."""
-    width, depth, height = float(rng.uniform(1.1, 1.4)), float(rng.uniform(0.5, 0.7)), float(rng.uniform(0.8, 1.1))
+    """A door without any grip, and beside it a panel with three or four buttons, or paddles that tilt inward."""
+    width, depth, height = float(rng.uniform(0.75, 0.9)), float(rng.uniform(0.4, 0.6)), float(rng.uniform(1.15, 1.3))
     side = 1.0 if rng.random() < 0.5 else -1.0
-    half, split = width / 2, side * (width / 2 - 0.34)
+    half, split = width / 2, side * (width / 2 - 0.4)
     panel, opening = sorted((split, side * half)), sorted((split, -side * half))
     body = (
         *hollow_box((0.0, -half, 0.0), (depth, half, height), 0.03, (FRONT,)),
@@ -31,7 +31,7 @@ def random_button_cabinet(rng: np.random.Generator) -> ObjectModel:
     low, high = (-GAP - PLATE, opening[0] + GAP / 2, 0.0), (-GAP, opening[1] - GAP / 2, height)
     hinge = (low[0], high[1] if side < 0 else low[1], height / 2)
     door = hinged("door", (block(low, high),), hinge, LEFT if side < 0 else RIGHT, FRONT, float(rng.uniform(1.4, 1.8)))
-    count, middle = int(rng.integers(2, 5)), (panel[0] + panel[1]) / 2
+    count, middle = int(rng.integers(3, 5)), (panel[0] + panel[1]) / 2
     make = _button if rng.random() < 0.5 else _paddle
     heights = (np.arange(count) + 0.5) / count * (height - 0.1) + 0.05
     return ObjectModel("ButtonCabinet", "cabinet_body", body, (door, *(make(middle, float(z)) for z in heights)))
@@ -55,11 +55,11 @@ def random_handle_cabinet(rng: np.random.Generator) -> ObjectModel:
 def _button(y: float, z: float) -> MovablePart:
     """A button on the panel, which goes in when it is pressed."""
     face = -PLATE - GAP - PRESS
-    return sliding("button", (block((face - 0.04, y - 0.08, z - 0.08), (face, y + 0.08, z + 0.08)),), BACK, PRESS)
+    return sliding("button", (block((face - 0.04, y - 0.13, z - 0.11), (face, y + 0.13, z + 0.11)),), BACK, PRESS)
 
 
 def _paddle(y: float, z: float) -> MovablePart:
     """A plate before the panel, whose lower edge goes in when it is pressed."""
     face = -PLATE - 0.04
-    pieces: Pieces = (block((face - 0.025, y - 0.08, z - 0.09), (face, y + 0.08, z + 0.07)),)
-    return MovablePart("lever", "revolute", pieces, (face, y, z + 0.07), RIGHT, TILT)
+    pieces: Pieces = (block((face - 0.025, y - 0.13, z - 0.12), (face, y + 0.13, z + 0.1)),)
+    return MovablePart("lever", "revolute", pieces, (face, y, z + 0.1), RIGHT, TILT)
