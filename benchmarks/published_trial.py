@@ -155,7 +155,7 @@ def _settle(scene: Scene) -> float:
     begun, short = time.process_time(), 0.0
     before, still = scene.joint_positions(), 0
     for step in range(1, MOST_STEPS + 1):
-        scene.system.step()
+        scene.step()
         now = scene.joint_positions()
         pressed = any(
             float(point.impulse @ point.impulse) > STILL_IMPULSE_SQUARED

@@ -2,7 +2,8 @@
 
 Each is declared in one record. Drawing, settings, columns of the store, facts for the oracle, and the words and tables
 of the report follow from it. A package adds one by an entry point of the group `adaafford.hidden_parameters`
-(docs/extending.md). All but the first three are active only in settings that name them in `collection.dynamics`.
+(docs/extending.md). All but the first three are active only in settings that name them in `collection.dynamics`, or
+whose task does.
 """
 
 import re
@@ -10,6 +11,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shared.errors import UsageError
 from shared.extensions import Registry
@@ -32,6 +36,26 @@ class HiddenTarget(Protocol):
 
     def set_surface_friction(self, coefficient: float) -> None:
         """Set the friction coefficient of the surfaces of hand and object."""
+        ...
+
+    def set_catch(self, breakaway: float) -> None:
+        """Hold every closed part that is no handle until this much more than friction, N m or N, acts on its joint."""
+        ...
+
+    def set_latch(self, travel: float | None = None, handle: float | None = None) -> None:
+        """Lock every closed part that has a handle until the handle is moved.
+
+        Args:
+            travel: share of its range that the handle must have moved; from 1, every part stays locked; 0: no latch.
+            handle: which handle of several, from 0 for the first to 1 for the last.
+        """
+        ...
+
+    def before_step(self, mechanism: Callable[[NDArray[np.float64]], None]) -> None:
+        """Have `mechanism` called with the joint positions, [parts], before each step of the engine.
+
+        What it does may depend on these alone: they are all that a state has, and that a row is executed again from.
+        """
         ...
 
     @property
@@ -58,7 +82,7 @@ class HiddenParameter:
         log: whether the logarithm is uniform instead of the value.
         apply: applies a value to a simulated object; called once for each rollout.
         default: the value of rows in stores without the parameter, which is the simulator's value if `apply` is not
-            called. None: every store has it; only for the three built-in parameters.
+            called. None: every store has it; only for the first three.
     """
 
     name: str
@@ -112,6 +136,36 @@ BUILT_IN = {
             high=10.0,
             log=True,
             apply=lambda target, value: target.set_surface_friction(value),
+        ),
+        HiddenParameter(
+            name="catch_force",
+            description="what a catch adds to the friction of a closed joint, N m if it turns, N if it slides",
+            unit="",
+            low=0.5,
+            high=10.0,
+            log=True,
+            apply=lambda target, value: target.set_catch(value),
+            default=0.0,
+        ),
+        HiddenParameter(
+            name="latch_travel",
+            description="share of its range that a handle must move to open its latch; locked for good from 1",
+            unit="",
+            low=0.2,
+            high=1.1,
+            log=False,
+            apply=lambda target, value: target.set_latch(travel=value),
+            default=0.0,
+        ),
+        HiddenParameter(
+            name="latch_handle",
+            description="which of several handles opens the latch, from 0 for the first to 1 for the last",
+            unit="",
+            low=0.0,
+            high=1.0,
+            log=False,
+            apply=lambda target, value: target.set_latch(handle=value),
+            default=0.0,
         ),
     )
 }

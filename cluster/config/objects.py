@@ -7,7 +7,7 @@ from pathlib import Path
 from cluster.config.campaign_config import SplitConfig
 from cluster.config.selection import ObjectSelection
 from collector.objects.catalogue import Catalogue, ObjectSplit, for_task, of_categories, read_list, scan, split
-from collector.objects.procedural.catalogue import CATEGORIES, categories_of
+from collector.objects.procedural.catalogue import EVERY_CATEGORY, categories_of
 from collector.objects.procedural.writing import generate
 from shared.categories import expanded
 from shared.errors import UsageError
@@ -85,10 +85,10 @@ def built_in_categories(task: Task, categories: tuple[str, ...]) -> list[str]:
     Raises:
         UsageError: an unknown category, or none of those that are named suits the task.
     """
-    named = expanded(categories) or tuple(CATEGORIES)
-    allowed = categories_of(task)
+    named = expanded(categories) or tuple(categories_of(task) or EVERY_CATEGORY)
+    allowed = [name for name in EVERY_CATEGORY if not task.categories or name in task.categories]
     suited = [name for name in named if name in allowed]
-    wrong = next((name for name in named if name not in CATEGORIES), None if suited else named[0])
+    wrong = next((name for name in named if name not in EVERY_CATEGORY), None if suited else named[0])
     if wrong is not None:
         raise UsageError(f"no built-in {short(wrong)} for the task '{task.name}'; allowed: {', '.join(allowed)}")
     return suited

@@ -31,7 +31,8 @@ class SapienEnvironment:
     """Implements `collector.sim.simulator.SimEnvironment` with SAPIEN's physics and a depth camera.
 
     All interactions of a rollout are on one part, because z describes how one door or switch moves. The part is drawn
-    from those that the first observation shows and the task allows, in proportion to its visible points.
+    from those that the first observation shows and the task allows, in proportion to its visible points. Where there is
+    a latch, a door and its handles are one target, as far as the task allows them (`collector.sim.mechanisms.Holds`).
 
     Args:
         target: the object.
@@ -64,6 +65,7 @@ class SapienEnvironment:
         self._camera = camera_for(target, world_from_camera, self._camera_config)
         self._rng, self._errors = rng, rng.spawn(1)[0]  # What is drawn from one does not depend on the other.
         self._observed: Observation | None = None
+        self._chosen = False
         self._known: list[tuple[Float, Observation]] = []
         self._restricted = dynamics.direction is Direction.AS_BUILT
         self._disturbed = False
@@ -139,10 +141,12 @@ class SapienEnvironment:
         seen = observation_from(image, pose, self.parts, config, self._rng)
         if seen is None:
             raise LookupError(f"no pixel sees object {self.object.ref.id}")
-        if len(self.parts) > 1 and seen.movable.any():
-            part = int(self._rng.choice(seen.part_ids[seen.movable]))
-            self.parts = (part,)
-            seen = replace(seen, movable=seen.part_ids == part)
+        if not self._chosen and seen.movable.any():
+            several = len(self.parts) > 1
+            part = int(self._rng.choice(seen.part_ids[seen.movable])) if several else self.parts[0]
+            together = self.scene.holds.target_of(part)
+            self.parts, self._chosen = tuple(k for k in self.parts if k in together), True
+            seen = replace(seen, movable=np.isin(seen.part_ids, self.parts))
         return seen
 
     def _settle(self) -> bool:

@@ -4,6 +4,7 @@ A scene is built for one rollout, always in the same order, so that a rollout gi
 it. At rest, the positions of the joints are the whole state of the object.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +12,13 @@ import numpy as np
 from collector.objects.articulation import ArticulatedObject, Joint
 from collector.sim.engine import Assembly, Link, new_scene, physx, pose, sapien, set_mass
 from collector.sim.grippers import GRIPPERS
+from collector.sim.mechanisms import FRICTION_DAMPING, Holds
 from shared.config import PANDA, Fidelity, Timing
 from shared.hidden import HIDDEN_PARAMETERS
 from shared.primitives import PrimitiveSpec
 from shared.types import Direction, Float, HiddenDynamics
 
 RESTITUTION = 0.01
-FRICTION_DAMPING = 1e5
-"""Damping of the force-limited drive that stands for Coulomb friction: below its limit a joint creeps by at most
-limit / damping a second."""
 CONTACT_FORCE = 5.0
 """N. The published rule counts contact points with a squared impulse above 1e-4; at its 1/500 s that is this force."""
 CONTACT_RANGE = 0.02
@@ -69,8 +68,9 @@ class Scene:
         gripper: the name of the hand.
 
     Attributes:
-        system: SAPIEN's physics system; `system.step()` advances time.
+        system: SAPIEN's physics system.
         gripper: the flying hand.
+        holds: what resists the motion of the joints.
     """
 
     def __init__(
@@ -92,6 +92,8 @@ class Scene:
         names = [joint.name for joint in self._articulation.active_joints]
         self._order = np.array([names.index(joint.name) for joint in self._joints], dtype=np.int64)
         self._bodies = {link: k for k, link in enumerate(self._links)}
+        self.holds = Holds(target, self._joints)
+        self._mechanisms: list[Callable[[Float], None]] = []
         for name, value in dynamics.values.items():
             HIDDEN_PARAMETERS.get(name).apply(self, value)
         self.gripper = GRIPPERS.get(gripper).build(self._scene, self._material, fidelity.jointed_hand)
@@ -127,12 +129,37 @@ class Scene:
 
     def set_joint_friction(self, limit: float) -> None:
         """Set the Coulomb friction of every movable joint: N m if it turns, N if it slides."""
+        self.holds.friction = limit
         for joint in self.joints:
             joint.set_drive_property(0.0, FRICTION_DAMPING, force_limit=limit)
 
     def set_surface_friction(self, coefficient: float) -> None:
         """Set the static and dynamic friction coefficient of the surfaces of hand and object."""
         self._material.static_friction = self._material.dynamic_friction = coefficient
+
+    def set_catch(self, breakaway: float) -> None:
+        """See `shared.hidden.HiddenTarget`."""
+        self.holds.catch = breakaway
+        self.before_step(self.holds)
+
+    def set_latch(self, travel: float | None = None, handle: float | None = None) -> None:
+        """See `shared.hidden.HiddenTarget`."""
+        self.holds.latch_travel = self.holds.latch_travel if travel is None else travel
+        self.holds.latch_handle = self.holds.latch_handle if handle is None else handle
+        self.before_step(self.holds)
+
+    def before_step(self, mechanism: Callable[[Float], None]) -> None:
+        """See `shared.hidden.HiddenTarget`."""
+        if mechanism not in self._mechanisms:
+            self._mechanisms.append(mechanism)
+
+    def step(self) -> None:
+        """Advance time by one step; mechanisms act first."""
+        if self._mechanisms:
+            positions = self.joint_positions()
+            for mechanism in self._mechanisms:
+                mechanism(positions)
+        self.system.step()
 
     def set_timing(self, timing: Timing) -> None:
         """Use `timing` for the time step and for the hand from now on."""
@@ -162,7 +189,7 @@ class Scene:
         self.park()
         for _ in range(FORGETTING_STEPS):
             self._set_joint_positions(positions)
-            self.system.step()
+            self.step()
         self._set_joint_positions(positions)
         self.park()
 
@@ -195,7 +222,7 @@ class Scene:
         self.park()
         before, still = self.joint_positions(), 0
         for _ in range(most_steps):
-            self.system.step()
+            self.step()
             now = self.joint_positions()
             moved = np.abs(now - before).max(initial=0.0) >= 1e-6
             still = 0 if moved or (still % 16 == 0 and self._presses()) else still + 1

@@ -66,6 +66,7 @@ class Trial:
         self.scene = scene
         self.action = action
         self.target = target
+        self._judged = scene.holds.judged(target) - 1
         self.primitive = primitive
         self.fidelity = fidelity
         self.steps = 0
@@ -85,7 +86,7 @@ class Trial:
         """Execute the primitive and judge it; the scene is left as the trial leaves it, the hand parked."""
         scene = self.scene
         before = scene.joint_positions()
-        start = before[self.target - 1]
+        start = before[self._judged]
         body_from_world = np.linalg.inv(scene.body_pose(self.target))
         local = body_from_world @ np.append(self.action.point, 1.0)
         scene.gripper.place(self.action.rotation, hand_start(self.action), opened=self.primitive.closes_fingers)
@@ -97,7 +98,7 @@ class Trial:
         if kind is OutcomeKind.START_COLLISION:
             # A hand cannot be where something else is; what one step of overlap did to the object never happened.
             scene.put(before)
-        end = scene.joint_positions()[self.target - 1]
+        end = scene.joint_positions()[self._judged]
         displacement = (scene.body_pose(self.target) @ local)[:3] - self.action.point
         scene.park()
         if not np.isfinite(scene.joint_positions()).all() or np.abs(scene.joint_positions()).max() > SANE_POSITION:
@@ -247,7 +248,7 @@ class Trial:
         first = self.steps == 0 and self.fidelity.version > 1
         if first:
             self.scene.set_timing(FIRST_STEP)
-        self.scene.system.step()
+        self.scene.step()
         self.steps += 1
         if self._closed:
             self._attached = self.scene.gripper.attached()
@@ -279,7 +280,7 @@ class Trial:
         self._checked = contact.presses or (not self.primitive.checks_contact and self._brushed)
 
     def _succeeded(self, start: float, end: float, displacement: Float) -> bool:
-        low, high = self.scene.limits[self.target - 1]
+        low, high = self.scene.limits[self._judged]
         motion = abs(end - start)
         if not (motion > MOTION_THRESHOLD or motion > MOTION_SHARE * (high - low)):
             return False

@@ -1,5 +1,7 @@
 """The simplest articulated objects, made of boxes, whose right answers are known by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from collector.objects.articulation import ArticulatedObject, Body, Joint, Mesh
@@ -59,6 +61,17 @@ def drawer() -> ArticulatedObject:
     block = box((0.0, -0.2, -0.2), (0.4, 0.2, 0.2))
     joint = Joint("slide", "prismatic", 0, np.eye(4), np.array([1.0, 0.0, 0.0]), 0.0, 0.5)
     return base_with(box((0.0, 1.0, 0.0), (0.1, 1.1, 0.1)), Body("block", "drawer", joint, (block,), (block,)))
+
+
+def latched_door() -> ArticulatedObject:
+    """The door of `door`, a lever on it that turns by up to 1 rad, and below it a button that goes in by up to 0.02."""
+    base, slab = door().bodies
+    lever = box((-0.06, -0.04, -0.04), (0.0, 0.1, 0.04))
+    turn = Joint("turn", "revolute", 1, _translation(-0.03, -0.5, 0.0), np.array([1.0, 0.0, 0.0]), 0.0, 1.0)
+    button = box((-0.04, -0.05, -0.05), (0.0, 0.05, 0.05))
+    press = Joint("press", "prismatic", 0, _translation(-0.3, 0.0, -0.5), np.array([1.0, 0.0, 0.0]), 0.0, 0.02)
+    handles = (Body("lever", "lever", turn, (lever,), (lever,)), Body("button", "button", press, (button,), (button,)))
+    return replace(base_with(base.visuals[0], slab), bodies=(base, slab, *handles))
 
 
 def base_with(root: Mesh, part: Body) -> ArticulatedObject:

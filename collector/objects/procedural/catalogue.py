@@ -21,6 +21,7 @@ from collector.objects.procedural.containers import (
 )
 from collector.objects.procedural.faucets import random_faucet
 from collector.objects.procedural.fitted import random_cabinet
+from collector.objects.procedural.latched import random_button_cabinet, random_handle_cabinet
 from collector.objects.procedural.openings import random_door, random_switch, random_window
 from shared.seeds import generator
 from shared.tasks import Task
@@ -43,13 +44,15 @@ CATEGORIES: Mapping[str, Callable[[np.random.Generator], ObjectModel]] = {
     "Safe": random_safe,
 }
 """The paper's fifteen, called as PartNet-Mobility calls them."""
+EVERY_CATEGORY = {**CATEGORIES, "ButtonCabinet": random_button_cabinet, "HandleCabinet": random_handle_cabinet}
+"""With those that are only made where a task or a command names them."""
 
 
 def categories_of(task: Task) -> list[str]:
-    """The categories that a task applies to."""
-    return [name for name in CATEGORIES if not task.categories or name in task.categories]
+    """The categories that a task applies to: those that it names, or the paper's."""
+    return [name for name in EVERY_CATEGORY if name in (task.categories or CATEGORIES)]
 
 
 def build(category: str, seed: int, index: int) -> ObjectModel:
     """Object number `index` of a category: a pure function of its arguments, whatever else is made."""
-    return normalised(CATEGORIES[category](generator(seed, f"procedural {category}", index)))
+    return normalised(EVERY_CATEGORY[category](generator(seed, f"procedural {category}", index)))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from collector.objects.procedural.catalogue import CATEGORIES, build
+from collector.objects.procedural.catalogue import EVERY_CATEGORY, build
 from collector.objects.writing import write_object
 from shared.errors import UsageError
 from shared.io.files import TEMPORARY_PREFIX, remove_if_abandoned
@@ -17,7 +17,7 @@ def generate(out: Path, counts: Mapping[str, int], seed: int) -> list[Path]:
 
     Args:
         out: folder of objects; made if need be.
-        counts: how many of each category of `CATEGORIES`.
+        counts: how many of each category of `EVERY_CATEGORY`.
         seed: of the whole collection, non-negative.
 
     Returns:
@@ -27,9 +27,9 @@ def generate(out: Path, counts: Mapping[str, int], seed: int) -> list[Path]:
         UsageError: an unknown category, a negative count or seed, or a folder that cannot be written or holds another
             object of the same name.
     """
-    unknown = sorted(set(counts) - set(CATEGORIES))
+    unknown = sorted(set(counts) - set(EVERY_CATEGORY))
     if unknown:
-        raise UsageError(f"unknown category {short(unknown[0])}; allowed: {', '.join(CATEGORIES)}")
+        raise UsageError(f"unknown category {short(unknown[0])}; allowed: {', '.join(EVERY_CATEGORY)}")
     if seed < 0 or min(counts.values(), default=0) < 0:
         raise UsageError(f"seed and counts must not be negative; given seed {seed}, counts {dict(counts)}")
     try:
