@@ -8,14 +8,15 @@ from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import CloudBatch, PointNet2
 
 SEGMENTATION_NETWORK = NetworkConfig(
-    centres=(1024, 256, 64),
-    radii=(0.1, 0.25, 0.7),
+    centres=(1024, 256, 64, 16),
+    radii=(0.1, 0.25, 0.7, 2.5),
     neighbours=16,
-    abstraction=((32, 48), (64, 96), (128, 192)),
-    propagation=((160,), (128,), (128, 96)),
+    abstraction=((32, 48), (64, 96), (128, 192), (192, 256)),
+    propagation=((192,), (160,), (128,), (128, 96)),
     feature_width=96,
     surroundings=0,
 )
+"""Small, and with a last level that sees a whole object: where the middle of a door is depends on all of it."""
 
 
 class SegmentationNetwork(nn.Module):

@@ -106,7 +106,7 @@ class Segmenter:
         given, _ = network_input(points, camera, seed)
         probabilities, votes = self._evaluated(given)
         kinds = probabilities.argmax(axis=1)
-        labels = _labels(given.points, kinds, votes)
+        labels = part_labels(given.points, kinds, votes)
         if not (labels >= 0).any():
             raise UsageError("no object is seen in the scan; move the camera towards it")
         spread = _spread(points[given.left], points[given.rows], labels)
@@ -164,7 +164,7 @@ def begun(seed: int) -> SegmentationNetwork:
         return SegmentationNetwork(SEGMENTATION_NETWORK, len(Kind), EXTRA)
 
 
-def _labels(points: Float32, kinds: NDArray[np.int64], votes: Float32) -> NDArray[np.int64]:
+def part_labels(points: Float32, kinds: NDArray[np.int64], votes: Float32) -> NDArray[np.int64]:
     """Of each of the network's points -1 for background, 0 for the object's body, n for the n-th part, [N]."""
     labels = np.full(len(points), -1)
     of_object = np.flatnonzero(kinds != Kind.BACKGROUND)

@@ -51,6 +51,7 @@ def test_surroundings_stand_beside_the_object_and_hide_it(cabinet: ArticulatedOb
         assert np.isin(seen.kinds, MOVABLE).any()
 
 
+@pytest.mark.slow
 def test_floor_and_walls_go_and_the_object_stays(cabinet: ArticulatedObject) -> None:
     for seed in range(3):
         seen = random_scan(cabinet, (1.0, 1.0), generator(seed, "test"))
@@ -70,6 +71,7 @@ def test_an_object_without_floor_loses_nothing(cabinet: ArticulatedObject) -> No
     assert not gone.any()
 
 
+@pytest.mark.slow
 def test_the_input_of_the_network_does_not_depend_on_where_the_scan_lies(cabinet: ArticulatedObject) -> None:
     seen = random_scan(cabinet, (0.5, 0.5), generator(1, "test"))
     points, camera = seen.image.points, seen.world_from_camera[:3, 3]
@@ -87,6 +89,7 @@ def test_only_floor_is_refused() -> None:
         network_input(floor, np.array([-3.0, 0.0, 2.0]))
 
 
+@pytest.mark.slow
 def test_scenes_are_made_once_and_go_on(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "scenes"
     assert adaafford(["objects", "scenes", str(folder), str(out), "--count", "2"]) == 0

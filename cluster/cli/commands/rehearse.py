@@ -54,8 +54,11 @@ class RehearseCommand:
     """Strength of the scans' errors: 0 is none, 1 a structured-light camera one metre from the object."""
     marked: bool = True
     """Whether scans mark the points of the part that is to be moved."""
+    scene: bool = False
+    """Scans are raw: the object stands on a floor, perhaps before walls and among other things, and nothing is marked.
+    With --policy the session finds the part itself, as `adapt --part auto` does."""
     seed: int = 1
-    """Everything random derives from it: objects, hidden dynamics, camera, states, noise."""
+    """Everything random derives from it: objects, hidden dynamics, camera, states, noise, surroundings."""
 
 
 def main(args: list[str]) -> int:
@@ -114,7 +117,8 @@ def _robots(command: RehearseCommand) -> Iterator["SimulatedRobot"]:
             seed=command.seed,
             number=number,
             noise=command.noise,
-            marked=command.marked,
+            marked=command.marked and not command.scene,
+            scene=command.scene,
         )
         yield SimulatedRobot(environment, setting, folder)
 
@@ -133,12 +137,13 @@ def _follow(robot: "SimulatedRobot") -> int:
 
 def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy") -> bool:
     """A whole session with one robot; whether it succeeded."""
+    from adaafford.parts import AUTO
     from adaafford.sessions import Session, SessionFiles
     from cluster.evaluation.rehearsal import Goal, rehearse
 
     folder = robot.folder
     files = SessionFiles(folder / "history.json", folder / "heatmap.ply")
-    session = Session(policy, files, command.budget, command.seed)
+    session = Session(policy, files, command.budget, command.seed, part=AUTO if command.scene else None)
 
     def tell(step: "Step", request: "Request") -> None:
         assert request.outcome is not None, "an action has an outcome"
