@@ -24,6 +24,8 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, field_validator
 
 from adaafford.columns import shown, without_mark
+from adaafford.depth_images import Lens
+from adaafford.parts import FollowedPart, part_choice
 from adaafford.scans import ScanFrame, Vector, action_at
 from shared.config import StrictModel
 from shared.errors import UsageError
@@ -96,6 +98,8 @@ class TriedInteraction(StrictModel):
     """The hand's forward direction, which defines its roll (see docs/robot.md)."""
     outcome: TriedOutcome | None = None
     """None until the interaction was executed."""
+    part: FollowedPart | None = Field(None, exclude_if=lambda part: part is None)
+    """Of a raw scan: where the part is that is followed."""
 
     @field_validator("cloud")
     @classmethod
@@ -112,6 +116,10 @@ class History(StrictModel):
     format: Literal["adaafford-history"] = "adaafford-history"
     schema_version: Literal[1] = 1
     frame: ScanFrame
+    lens: Lens | None = Field(None, exclude_if=lambda lens: lens is None)
+    """Of depth images: the camera's intrinsics and pose. None: scans are clouds."""
+    part: Annotated[str, AfterValidator(part_choice)] | None = Field(None, exclude_if=lambda choice: choice is None)
+    """Of raw scans: which part was wanted of the first. None: scans are of the object alone."""
     interactions: tuple[TriedInteraction, ...] = Field((), max_length=MAX_TRIES)
 
     @property
@@ -124,8 +132,14 @@ class History(StrictModel):
         """The interactions with an outcome."""
         return tuple(each for each in self.interactions if each.outcome is not None)
 
-    def proposing(self, action: Action, cloud: str, cloud_sha256: str) -> "History":
+    def proposing(self, action: Action, cloud: str, cloud_sha256: str, part: FollowedPart | None = None) -> "History":
         """This history with a proposal at its end; it replaces one that was not executed.
+
+        Args:
+            action: the proposal.
+            cloud: the scan that it was made with.
+            cloud_sha256: the hash of that scan's file.
+            part: of a raw scan: its parts.
 
         Raises:
             UsageError: the history is full.
@@ -139,6 +153,7 @@ class History(StrictModel):
             point=_rounded(frame.point_to_scan(action.point).tolist()),
             approach=_rounded(frame.direction_to_scan(action.approach).tolist()),
             forward=_rounded(frame.direction_to_scan(action.forward).tolist()),
+            part=part,
         )
         return self.model_copy(update={"interactions": (*self.tried, proposal)})
 

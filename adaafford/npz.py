@@ -24,8 +24,8 @@ _DAMAGED: tuple[type[Exception], ...] = (
 """What `zipfile` and `numpy.lib.format` raise when bytes are not what they pretend to be."""
 
 
-def read_npz(data: bytes) -> Columns:
-    """The arrays "points", and "normals", "movable" and "camera" where they are there.
+def read_npz(data: bytes, names: tuple[str, ...] = _NAMES) -> Columns:
+    """The first array of some names, and the others where they are there.
 
     Raises:
         ValueError: it holds no such arrays of numbers, or is damaged, with the reason.
@@ -36,9 +36,9 @@ def read_npz(data: bytes) -> Columns:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
-            if "points" not in entries:
-                raise ValueError(f"has no array 'points'; it holds {shown(entries)}")
-            wanted = {name: entries[name] for name in _NAMES if name in entries}
+            if names[0] not in entries:
+                raise ValueError(f"has no array {names[0]!r}; it holds {shown(entries)}")
+            wanted = {name: entries[name] for name in names if name in entries}
             if sum(entry.file_size for entry in wanted.values()) > MAX_SCAN_BYTES:
                 raise ValueError(f"unpacks to more than {MAX_SCAN_BYTES} bytes")
             found: Columns = {}
@@ -52,8 +52,19 @@ def read_npz(data: bytes) -> Columns:
         raise ValueError(" ".join(str(error).split())[:200] or type(error).__name__) from None
 
 
+def read_npy(file: IO[bytes], name: str, size: int) -> NDArray[np.generic]:
+    """An array of numbers from an NPY file of `size` bytes.
+
+    Raises:
+        ValueError: it is none, or damaged, with the reason.
+    """
+    try:
+        return _array(file, name, size)
+    except _DAMAGED as error:
+        raise ValueError(" ".join(str(error).split())[:200] or type(error).__name__) from None
+
+
 def _array(file: IO[bytes], name: str, size: int) -> NDArray[np.generic]:
-    """An array of numbers from an NPY file of `size` bytes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy warns of files that Python 2 wrote, which it reads.
         version = npy.read_magic(file)

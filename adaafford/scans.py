@@ -37,11 +37,13 @@ MAX_ROWS = 1 << 23
 """Of a cloud with the points that were not measured: an image in 4K."""
 POINTS, CANDIDATES = CameraConfig().points, CameraConfig().candidates
 """Kept of a scan, and drawn before that, as in training unless that was told otherwise."""
-MAX_EXTENT_M = 10.0
-"""No object that a hand opens is larger; clouds in millimetres are."""
+MAX_EXTENT_M, MAX_ROOM_M = 10.0, 50.0
+"""No object that a hand opens, and no raw scan of one, is larger; clouds in millimetres are."""
 MAX_OFF_CLOUD_M = 0.05
 """How far from the kept points an action's point may lie; they are a few centimetres apart at the most."""
 READERS = {".ply": read_ply, ".npz": read_npz, ".pcd": read_pcd}
+DEPTH_SUFFIXES = (".png", ".npy", ".npz")
+"""Of depth images (see `adaafford.depth_images`)."""
 _MIN_NORMAL = 1e-9
 _MISSING_SHARE = 0.1
 """What a depth camera misses without anybody being told."""
@@ -164,7 +166,7 @@ def read_scan(path: Path) -> Scan:
 
 def read_scan_file(path: Path) -> bytes:
     """The bytes of a cloud's file; raises as `read_scan` does."""
-    if path.suffix.lower() not in READERS:
+    if path.suffix.lower() not in {*READERS, *DEPTH_SUFFIXES}:
         raise UsageError(f"{path}: not a kind of cloud that is read; allowed: {', '.join(READERS)}")
     if not os.path.exists(path):  # noqa: PTH110 - a name too long for the disk is one that is not there.
         raise UsageError(f"{path}: there is no such file; name a cloud ({', '.join(READERS)})")
@@ -174,16 +176,20 @@ def read_scan_file(path: Path) -> bytes:
 
 
 @_SILENT
-def parse_scan(data: bytes, path: Path) -> Scan:
-    """A cloud from the bytes of its file; raises as `read_scan` does."""
+def parse_scan(data: bytes, path: Path, *, raw: bool = False) -> Scan:
+    """A cloud, of an object alone unless it is raw, from the bytes of its file; raises as `read_scan` does."""
     if not data:
         raise UsageError(f"{path}: is empty; export it again")
+    if path.suffix.lower() not in READERS:
+        raise UsageError(
+            f"{path}: a depth image needs the camera's --intrinsics FX FY CX CY; clouds are {', '.join(READERS)}"
+        )
     try:
         columns = READERS[path.suffix.lower()](without_mark(data))
     except ValueError as error:
         raise UsageError(f"{path}: not readable as {path.suffix[1:].upper()} ({error}); export it again") from None
     return checked_scan(
-        columns.get("points"), columns.get("normals"), columns.get("movable"), columns.get("camera"), str(path)
+        columns.get("points"), columns.get("normals"), columns.get("movable"), columns.get("camera"), str(path), raw=raw
     )
 
 
@@ -194,6 +200,8 @@ def checked_scan(
     movable: ArrayLike | None = None,
     camera: ArrayLike | None = None,
     source: str = "the cloud",
+    *,
+    raw: bool = False,
 ) -> Scan:
     """A scan from untrusted arrays.
 
@@ -203,6 +211,7 @@ def checked_scan(
         movable: [M], of 0 and 1, or false and true.
         camera: [3].
         source: its name in messages.
+        raw: whether the surroundings of the object are in it.
 
     Raises:
         UsageError: shapes do not agree, or values are none that are allowed, or too few or too many points are left,
@@ -229,11 +238,9 @@ def checked_scan(
         )
     measured = places[rows].astype(np.float64)
     extent = float(np.ptp(measured, axis=0).max())
-    if not 1e-3 < extent <= MAX_EXTENT_M:
-        raise UsageError(
-            f"{source}: measures {extent:g}; give one object, cut out of its surroundings, in metres (at most "
-            f"{MAX_EXTENT_M:g})"
-        )
+    most, what = (MAX_ROOM_M, "a scan") if raw else (MAX_EXTENT_M, "one object, cut out of its surroundings,")
+    if not 1e-3 < extent <= most:
+        raise UsageError(f"{source}: measures {extent:g}; give {what} in metres (at most {most:g})")
     return Scan(
         measured,
         None if facing is None else _known_normals(facing[rows]),

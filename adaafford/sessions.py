@@ -15,8 +15,10 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from adaafford.depth_images import Lens, parse_depth
 from adaafford.heatmaps import heatmap_writer, write_heatmap
 from adaafford.histories import History, ScanName, TriedOutcome, parse_json, read_history, scan_name, write_history
+from adaafford.parts import PARTS_SUFFIX, CutOut, FollowedPart, PartAnswer, PartFinder, part_choice
 from adaafford.scans import (
     POINTS,
     Scan,
@@ -52,11 +54,27 @@ class SessionFiles:
 
     Attributes:
         history: the history, created if missing; clouds are in its folder or below.
-        heatmap: the file for the adapted affordance (see `adaafford.heatmaps`); None: none is written.
+        heatmap: the file for the adapted affordance (see `adaafford.heatmaps`); None: none is written. Of raw scans,
+            the parts are written to a second file beside it.
     """
 
     history: Path
     heatmap: Path | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What is seen in a scan.
+
+    Attributes:
+        observation: of it.
+        sha256: of its file.
+        cut: of a raw scan: its parts.
+    """
+
+    observation: Observation
+    sha256: str
+    cut: CutOut | None
 
 
 class Seconds(StrictModel):
@@ -98,6 +116,8 @@ class Step(StrictModel):
     """Of the arm, if one was named."""
     seconds: float
     """Duration of the step."""
+    part: PartAnswer | None = Field(None, exclude_if=lambda answer: answer is None)
+    """Of a raw scan: the part that the action is on, and the others that were found."""
 
 
 class Health(StrictModel):
@@ -157,6 +177,9 @@ class Session:
         arm: that executes the actions; only what it reaches is proposed. None: anything is.
         base: x, y, z and yaw of its base, in the frame of the scans: m, and rad about `up` from x (from y where up is
             x). The floor is as low as the base, or as the lowest point of the scan.
+        part: which part of raw scans is acted on (see `PartChoice.of`); default: the history's, and without one, scans
+            are of the object alone.
+        lens: of the camera, if scans are depth images; default: the history's.
     """
 
     def __init__(
@@ -171,16 +194,20 @@ class Session:
         tell: Callable[[str], object] = lambda line: None,
         arm: Arm | None = None,
         base: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
+        part: str | None = None,
+        lens: Lens | None = None,
     ) -> None:
         policy.require("prior", "aap", "aip")
+        self._choice = None if part is None else part_choice(part)
+        self._task, self._finder = policy.task, None if part is None else PartFinder(policy.task)
         if files.heatmap is not None:
             heatmap_writer(files.heatmap)
         self._adapter = Adapter(policy)
         self._files, self._budget, self._seed, self._points = files, budget, seed, points
-        self._up, self._camera, self._tell = up, camera, tell
+        self._up, self._camera, self._lens, self._tell = up, camera, lens, tell
         self._arm, self._base = arm, base
         self._primitive = None if arm is None else PRIMITIVES.get(task_named(policy.task).primitive)
-        self._observations: dict[tuple[str, ScanFrame], Observation] = {}
+        self._seen: dict[tuple[str, ScanFrame, FollowedPart | None], _Seen] = {}
         self._steps = self._tries = 0
         self._seconds: Seconds | None = None
 
@@ -208,10 +235,16 @@ class Session:
         history = self._history(name)
         if outcome is not None and not self._is_told(history, outcome, interaction, name):
             history = history.concluding(outcome)
-        known = history.interactions_with(lambda each: self._observe(each.cloud, each.cloud_sha256, history.frame)[0])
-        observation, sha256 = self._observe(name, None, history.frame)
-        told = {id(each.observation) for each in known} | {id(observation)}
-        self._observations = {key: value for key, value in self._observations.items() if id(value) in told}
+        used: list[_Seen] = []
+
+        def observe(cloud: str, wanted: str | None, followed: FollowedPart | None) -> Observation:
+            used.append(self._observe(cloud, wanted, history, followed))
+            return used[-1].observation
+
+        known = history.interactions_with(lambda each: observe(each.cloud, each.cloud_sha256, each.part))
+        observation = observe(name, None, history.interactions[-1].part if history.interactions else None)
+        now, told = used[-1], {id(each) for each in used}
+        self._seen = {key: value for key, value in self._seen.items() if id(value) in told}
         read = time.perf_counter()
         rng = seeds.generator(self._seed, PURPOSE, len(known))
         action = AipProposer(self._adapter, rng, self._budget).propose(observation, known)
@@ -227,7 +260,10 @@ class Session:
             places = history.frame.point_to_scan(observation.points.astype(np.float64))
             reachable = None if observation.reach is None else reachable_points(observation)
             write_heatmap(self._files.heatmap, places, heat, observation.pixels, reachable)
-        history = history.proposing(action, name, sha256)
+            if now.cut is not None:
+                write_heatmap(parts_file(self._files.heatmap), *now.cut.picture())
+        answer = None if now.cut is None else now.cut.answer
+        history = history.proposing(action, name, now.sha256, None if answer is None else answer.followed)
         write_history(self._files.history, history)
         proposed, ended = history.interactions[-1], time.perf_counter()
         self._steps, self._tries = self._steps + 1, len(known)
@@ -244,6 +280,7 @@ class Session:
             belief=round(belief, 4),
             trajectory=trajectory,
             seconds=round(ended - begun, 3),
+            part=answer,
         )
 
     def _trajectory(self, observation: Observation, action: Action, cloud: Path) -> Trajectory | None:
@@ -297,18 +334,37 @@ class Session:
                     raise UsageError(
                         f"{self._files.history}: was begun with {setting} {kept}, now {given}; give the same"
                     )
-            return history
+            if self._lens not in (None, history.lens):
+                raise UsageError(f"{self._files.history}: was begun with another camera; give the same intrinsics")
+            return self._about_the_part(history)
         if not self._files.history.parent.is_dir():
             raise UsageError(
                 f"{self._files.history.parent}: there is no such folder; create it, and put the clouds there"
             )
         path, data, sha256 = self._file(name)
-        scan = parse_scan(data, path)
-        frame = ScanFrame.around(scan, self._up or (0.0, 0.0, 1.0), self._camera)
+        scan = self._parsed(data, path, self._choice, self._lens)
+        up = self._up or (self._lens.up if self._lens else None) or (0.0, 0.0, 1.0)
+        cut = None
+        if self._choice is not None:
+            assert self._finder is not None, "a choice needs what finds parts"
+            camera = self._camera or scan.camera or (0.0, 0.0, 0.0)
+            cut = self._finder.cut_out(scan, up, camera, self._choice, None, str(path))
+        frame = ScanFrame.around(scan if cut is None else cut.scan, up, self._camera)
         if self._up is None and (doubt := doubtful_up(scan, frame)):
             self._tell(f"{path}: {doubt}; if so, say it by --up and begin another history")
-        self._remember(scan, path, sha256, frame)
-        return History(frame=frame)
+        self._remember(scan, cut, sha256, frame, None)
+        return History(frame=frame, part=self._choice, lens=self._lens)
+
+    def _about_the_part(self, history: History) -> History:
+        """A history that is there, with the choice of the part that was given now, if nothing was tried before."""
+        if self._choice is None or self._choice == history.part:
+            return history
+        if history.part is None or history.tried:
+            which = "without a part" if history.part is None else f"with another part, {history.part}"
+            raise UsageError(
+                f"{self._files.history}: was begun {which}; leave --part as it was, or begin another history"
+            )
+        return history.model_copy(update={"part": self._choice, "interactions": ()})
 
     def _name_of(self, cloud: Path) -> str:
         """How a history in its folder names the cloud."""
@@ -325,17 +381,22 @@ class Session:
         except ValueError as error:
             raise UsageError(f"{plain(name)}: {error}; rename the scan") from None
 
-    def _observe(self, name: str, wanted: str | None, frame: ScanFrame) -> tuple[Observation, str]:
-        """The observation of a cloud's file, and the file's hash.
+    def _observe(self, name: str, wanted: str | None, history: History, followed: FollowedPart | None) -> "_Seen":
+        """What is seen in a cloud's file.
 
         It is made once for the same content, since the networks' work on it is remembered with it.
         """
         path, data, sha256 = self._file(name)
         if wanted not in (None, sha256):
             raise UsageError(f"{path}: was overwritten after its interaction; use a new file name for every scan")
-        if (sha256, frame) not in self._observations:
-            self._remember(parse_scan(data, path), path, sha256, frame)
-        return self._observations[sha256, frame], sha256
+        frame = history.frame
+        if (sha256, frame, followed) not in self._seen:
+            scan, cut = self._parsed(data, path, history.part, history.lens), None
+            if history.part is not None:
+                self._finder = self._finder or PartFinder(self._task)
+                cut = self._finder.cut_out(scan, frame.up, frame.camera, history.part, followed, str(path))
+            self._remember(scan, cut, sha256, frame, followed)
+        return self._seen[sha256, frame, followed]
 
     def _file(self, name: str) -> tuple[Path, bytes, str]:
         """A cloud's path, bytes and hash."""
@@ -343,13 +404,28 @@ class Session:
         data = read_scan_file(path)
         return path, data, hashlib.sha256(data).hexdigest()
 
-    def _remember(self, scan: Scan, path: Path, sha256: str, frame: ScanFrame) -> None:
+    def _parsed(self, data: bytes, path: Path, choice: str | None, lens: Lens | None) -> Scan:
+        raw = choice is not None
+        scan = parse_scan(data, path, raw=raw) if lens is None else parse_depth(data, path, lens, raw=raw)
         if missing := missing_points(scan):
             self._tell(f"{path}: {missing}")
-        observation = observation_of(scan, frame, self._seed, self._points)
+        return scan
+
+    def _remember(
+        self, scan: Scan, cut: CutOut | None, sha256: str, frame: ScanFrame, followed: FollowedPart | None
+    ) -> None:
+        scan = scan if cut is None else cut.scan
+        observed = observation_of(scan, frame, self._seed, self._points)
         if self._arm is not None and self._primitive is not None:
             x, y, z = frame.to_world([self._base[:3]])[0]
             surface = frame.to_world(scan.points[:: 1 + len(scan.points) // SURFACE_POINTS])
-            reach = ArmReach(self._arm, (x, y, z, self._base[3]), self._primitive, surface)
-            observation = replace(observation, reach=reach)
-        self._observations[sha256, frame] = observation
+            observed = replace(observed, reach=ArmReach(self._arm, (x, y, z, self._base[3]), self._primitive, surface))
+        seen = self._seen[sha256, frame, followed] = _Seen(observed, sha256, cut)
+        if cut is not None:
+            # So the history names the part from now on.
+            self._seen[sha256, frame, cut.answer.followed] = seen
+
+
+def parts_file(heatmap: Path) -> Path:
+    """The file for the parts of a raw scan, beside that of its heatmap."""
+    return heatmap.with_name(f"{heatmap.stem}{PARTS_SUFFIX}{heatmap.suffix}")

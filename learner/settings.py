@@ -166,6 +166,19 @@ class AdaptationConfig(TrainingConfig):
     """The longest context; every shorter one is trained in the same pass."""
 
 
+class SegmentationConfig(TrainingConfig):
+    """The training of the segmentation network."""
+
+    steps: int = Field(1300, ge=1)
+    learning_rate: float = Field(3e-3, gt=0)
+    validate_every: int = Field(100, ge=1)
+    patience: int = Field(20, ge=1)
+    checkpoint_seconds: float = Field(30.0, ge=0)
+    batch_scenes: int = Field(4, ge=1)
+    mirror: bool = True
+    """Reflect half of the scenes."""
+
+
 class AlternationConfig(StrictModel):
     """When `adaafford train alternate` ends."""
 

@@ -17,10 +17,13 @@ from pydantic import Field
 from adaafford.histories import TriedOutcome, parse_json
 from adaafford.scans import Scan, ScanFrame, action_at, npz_of
 from adaafford.sessions import Request, Session, Step
+from collector.objects.articulation import Body
 from collector.sim.armed import ArmedEnvironment
 from collector.sim.depth_noise import noisy
 from collector.sim.environment import camera_for
+from collector.sim.raw_scan import raw_scan
 from collector.sim.simulator import SimEnvironment
+from collector.sim.surroundings import draw_surroundings, extent
 from shared import seeds
 from shared.config import CameraConfig, StrictModel
 from shared.errors import UsageError
@@ -31,7 +34,7 @@ STATE = "rehearsal.json"
 MAX_STATE_BYTES = 1 << 20
 BASE = (1.2, 0.0, 0.6)
 """Where the object's origin is in the frame of the scans without an arm, m; z is up, and the object faces -x."""
-PURPOSE = "depth noise"
+PURPOSE, SURROUNDINGS_PURPOSE = "depth noise", "surroundings"
 
 
 class Setting(StrictModel):
@@ -45,6 +48,7 @@ class Setting(StrictModel):
         noise: see `collector.sim.depth_noise`.
         marked: whether scans say which points the policy may act on.
         arm: name or file of the arm; None: the hand flies.
+        scene: whether scans are raw: with a floor, perhaps walls and other things, and nothing marked.
     """
 
     task: str
@@ -54,6 +58,7 @@ class Setting(StrictModel):
     noise: float
     marked: bool
     arm: str | None = Field(None, exclude_if=lambda arm: arm is None)
+    scene: bool = False
 
 
 class Executed(StrictModel):
@@ -182,19 +187,28 @@ class SimulatedRobot:
         return self.folder / f"scan-{number + 1}.npz"
 
     def _write_scan(self, number: int) -> None:
-        camera = camera_for(self._environment.object, self._pose, self._config)
-        rng = seeds.generator(self._state.setting.seed, PURPOSE, number)
-        place = self._pose[:3, 3]
-        image = noisy(
-            camera.capture(self._environment.state()), self._config.image_size, place, self._state.setting.noise, rng
-        )
+        setting, target, state = self._state.setting, self._environment.object, self._environment.state()
+        rng, place = seeds.generator(setting.seed, PURPOSE, number), self._pose[:3, 3]
+        if setting.scene:
+            image = raw_scan(target, state, self._pose, self._surroundings(), setting.noise, rng).image
+        else:
+            camera = camera_for(target, self._pose, self._config)
+            image = noisy(camera.capture(state), self._config.image_size, place, setting.noise, rng)
         x, y, z = (place + self._origin).tolist()
         scan = Scan(
             (image.points + self._origin).astype(np.float32).astype(np.float64),
-            movable=np.isin(image.bodies, self._parts) if self._state.setting.marked else None,
+            movable=np.isin(image.bodies, self._parts) if setting.marked else None,
             camera=(x, y, z),
         )
         write_atomically(self._scan_path(number), npz_of(scan))
+
+    def _surroundings(self) -> Body:
+        """What stands around the object, out of the way of its parts; the same in all scans."""
+        setting, target = self._state.setting, self._environment.object
+        limits = target.limits()
+        states = np.stack([limits[:, 0], limits.mean(axis=1), limits[:, 1], np.array(self._state.start)])
+        rng = seeds.generator(setting.seed, SURROUNDINGS_PURPOSE, setting.number)
+        return draw_surroundings(*extent(target, states), self._pose[:3, 3], rng)
 
     def _write_state(self) -> None:
         write_atomically(self.folder / STATE, self._state.model_dump_json(indent=2).encode() + b"\n")

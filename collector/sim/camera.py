@@ -18,6 +18,8 @@ from shared.types import Float, Observation
 
 NEAR, FAR = 0.1, 100.0
 """Published clipping distances."""
+SURROUNDINGS = 255
+"""The number, in `DepthImage.bodies`, of what is not the object; objects have fewer bodies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +31,7 @@ class DepthImage:
         depths: [H], distance along the camera's forward axis.
         points: [H, 3], world.
         normals: [H, 3], world, unit, facing the camera.
-        bodies: [H], 0 for the root, k for the k-th part.
+        bodies: [H], 0 for the root, k for the k-th part, `SURROUNDINGS` for what stands around the object.
     """
 
     pixels: NDArray[np.uint32]
@@ -61,10 +63,16 @@ class EmbreeCamera:
         world_from_camera: [4, 4].
         config: image size and field of view.
         height: of the image, pixels, if it is not as high as wide; the field of view is then its horizontal one.
+        surroundings: what stands around the object, in the world frame; it hides the object, and is seen.
     """
 
     def __init__(
-        self, target: ArticulatedObject, world_from_camera: Float, config: CameraConfig, height: int | None = None
+        self,
+        target: ArticulatedObject,
+        world_from_camera: Float,
+        config: CameraConfig,
+        height: int | None = None,
+        surroundings: Body | None = None,
     ) -> None:
         self.world_from_camera = world_from_camera
         self._object = target
@@ -73,6 +81,7 @@ class EmbreeCamera:
         if target not in _SCENES:
             _SCENES[target] = tuple(_BodyScene(body) for body in target.bodies)
         self._bodies = _SCENES[target]
+        self._surroundings = None if surroundings is None else _BodyScene(surroundings)
 
     def capture(self, joint_positions: Float) -> DepthImage:
         """The image with the parts at `joint_positions`, [parts]."""
@@ -82,7 +91,10 @@ class EmbreeCamera:
         """The image with the bodies, whatever joins them, at these poses, [bodies, 4, 4]."""
         count = self._width * self._height
         depths, normals, bodies = np.full(count, FAR), np.zeros((count, 3)), np.zeros(count, dtype=np.uint8)
-        for number, (body, world_from_body) in enumerate(zip(self._bodies, world_from_bodies, strict=True)):
+        seen_bodies = list(enumerate(zip(self._bodies, world_from_bodies, strict=True)))
+        if self._surroundings is not None:
+            seen_bodies.append((SURROUNDINGS, (self._surroundings, np.eye(4))))
+        for number, (body, world_from_body) in seen_bodies:
             body_from_camera = np.linalg.inv(world_from_body) @ self.world_from_camera
             pixels = self._pixels_around(body.vertices, body_from_camera)
             if len(pixels) == 0:

@@ -32,11 +32,18 @@ class CloudBatch:
         points: [B, N, 3], view frame, furthest-point order.
         neighbours: for each level [B, n, k] (see `shared.networks.grouping.Grouping`).
         nearest: for each level [B, m, 3].
+        extra: [B, N, E], further inputs of each point; None: its place is all that is known of it.
     """
 
     points: Tensor
     neighbours: tuple[Tensor, ...]
     nearest: tuple[Tensor, ...]
+    extra: Tensor | None = None
+
+    @property
+    def inputs(self) -> Tensor:
+        """What is known of each point, [B, N, 3 + E]."""
+        return self.points if self.extra is None else torch.cat([self.points, self.extra], dim=-1)
 
     @classmethod
     def of(cls, points: Float32 | Sequence[Float32], groupings: Iterable[Grouping]) -> "CloudBatch":
@@ -55,7 +62,10 @@ class CloudBatch:
     def select(self, clouds: Tensor) -> "CloudBatch":
         """The clouds at the indices `clouds`, [any]."""
         return CloudBatch(
-            self.points[clouds], tuple(x[clouds] for x in self.neighbours), tuple(x[clouds] for x in self.nearest)
+            self.points[clouds],
+            tuple(x[clouds] for x in self.neighbours),
+            tuple(x[clouds] for x in self.nearest),
+            None if self.extra is None else self.extra[clouds],
         )
 
 
@@ -81,6 +91,7 @@ class PointNet2(nn.Module):
 
     Its last step, the propagation from the first level's centres to the points, is done only where a feature is
     needed (`at`): the same values at a fraction of the cost, since a cloud has thousands of points and few actions.
+    `extra` is how many further inputs each point has.
     Under batch normalisation that last step's statistics are those of the queried points (a deviation).
 
     Example:
@@ -89,11 +100,11 @@ class PointNet2(nn.Module):
         >>> features = encoder.at(encoded, cloud, point)  # [Q, 128], as often as needed
     """
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: NetworkConfig, extra: int = 0) -> None:
         super().__init__()
         self.width = config.point_width
         self.surroundings = config.surroundings
-        widths = [3]
+        widths = [3 + extra]
         self.abstractions = nn.ModuleList()
         for layer_widths in config.abstraction:
             self.abstractions.append(SetAbstraction(widths[-1], layer_widths, config.normalisation))
@@ -106,7 +117,7 @@ class PointNet2(nn.Module):
 
     def forward(self, clouds: CloudBatch) -> EncodedClouds:
         """Encode clouds up to the features of the first level's centres."""
-        positions, features = [clouds.points], [clouds.points]
+        positions, features = [clouds.points], [clouds.inputs]
         for abstraction, neighbours in zip(self.abstractions, clouds.neighbours, strict=True):
             features.append(abstraction(positions[-1], features[-1], neighbours.long()))
             positions.append(positions[-1][:, : neighbours.shape[1]])
@@ -133,7 +144,8 @@ class PointNet2(nn.Module):
         features = encoded.centre_features.flatten(0, 1).index_select(0, rows).reshape(*nearest.shape, -1)
         weights = interpolation_weights(xyz[:, None], points[cloud[:, None], nearest])
         spread = (features * weights[..., None]).sum(dim=1)
-        result = self.propagations[-1](torch.cat([spread, xyz], dim=-1))
+        known = xyz if encoded.clouds.extra is None else torch.cat([xyz, encoded.clouds.extra[cloud, point]], dim=-1)
+        result = self.propagations[-1](torch.cat([spread, known], dim=-1))
         assert isinstance(result, Tensor)
         return result
 

@@ -473,7 +473,7 @@ def test_a_long_session_forgets_scans_that_nothing_was_tried_on(policy_folder: P
         again = scan.parent / f"again-{number}.npz"
         np.savez(again, points=front() + 0.001 * number)
         lasting.step(again)
-    assert len(lasting._observations) == 1
+    assert len(lasting._seen) == 1
 
 
 def test_what_was_tried_is_remembered_though_its_hash_was_left_out(policy_folder: Path, scan: Path) -> None:
@@ -482,10 +482,10 @@ def test_what_was_tried_is_remembered_though_its_hash_was_left_out(policy_folder
     np.savez(later, points=front(seed=2))
     lasting = session(policy_folder, scan)
     lasting.step(later)
-    before = dict(lasting._observations)
+    before = dict(lasting._seen)
     lasting.step(later)
     assert len(before) == 2
-    assert all(lasting._observations[key] is observation for key, observation in before.items())
+    assert all(lasting._seen[key] is observation for key, observation in before.items())
 
 
 def test_what_looks_wrong_in_a_scan_is_said_once_and_changes_nothing(

@@ -69,6 +69,19 @@ def test_an_answer_that_comes_again_is_executed_once(make_robot: Callable[..., S
     assert len(robot.executed) == 1
 
 
+def test_a_scene_is_scanned_raw_and_the_same_after_an_interruption(make_robot: Callable[..., SimulatedRobot]) -> None:
+    robot = make_robot(scene=True, marked=False)
+    path = robot.folder / robot.request.cloud
+    whole, scanned = path.read_bytes(), read_scan(path)
+    assert scanned.movable is None
+    width, height = np.ptp(scanned.points[:, 1]), np.ptp(scanned.points[:, 2])
+    assert width > 3.0 > height, "a floor"
+    (robot.folder / STATE).unlink()
+    path.unlink()
+    make_robot(scene=True, marked=False)
+    assert path.read_bytes() == whole
+
+
 def test_what_points_into_the_air_touches_nothing(make_robot: Callable[..., SimulatedRobot]) -> None:
     robot = make_robot()
     told = robot.execute(a_step(robot, 1).model_copy(update={"point": (9.0, 9.0, 9.0)}))

@@ -32,7 +32,8 @@ class AdaptCommand:
     """
 
     cloud: Path
-    """A scan of the object in its present state (.ply, .npz or .pcd): metres, only the object."""
+    """A scan of the object in its present state (.ply, .npz or .pcd): metres, only the object unless --part is given.
+    Or a depth image (.png of 16 bits in mm; .npy, or .npz with `depth`, in metres) with --intrinsics."""
     history: Path
     """The interactions so far (JSON), created if missing. Scans are in the same folder or below."""
     policy: str | None = None
@@ -40,6 +41,10 @@ class AdaptCommand:
     bundled policy, if there is only one."""
     out: Path | None = None
     """File for the adapted affordance: .ply, .npz or .html; default: heatmap.ply beside the history."""
+    part: str | None = None
+    """Of raw scans, with the object's surroundings: the part to act on: auto (the most confident), the number of one
+    that an answer names, or a point on it as X,Y,Z. It is followed in later scans. Default: the history's; without
+    one, a scan is of the object alone."""
     outcome: float | None = None
     """How far the part moved in the interaction of the last call: rad if it turns, m if it slides, 0 for no motion."""
     kind: OutcomeKind = OutcomeKind.UNKNOWN
@@ -56,6 +61,11 @@ class AdaptCommand:
     right, y down and z forward has 0 -1 0."""
     camera: tuple[float, float, float] | None = None
     """The camera position in the scan's frame; default: that of the history or the scan, otherwise 0 0 0."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """Of the camera of depth images: FX FY CX CY, pixels; default: the history's."""
+    pose: tuple[float, float, float, float, float, float, float] | None = None
+    """Where that camera stands: x y z in metres and its rotation as a quaternion x y z w, in the frame of the answers.
+    Default: answers are in its own frame (x right, y down, z forward), and up is 0 -1 0."""
     budget: int = 4
     """The most interactions that are proposed before the final action."""
     points: int = 2048
@@ -94,6 +104,7 @@ def main(args: list[str]) -> int:
         raise UsageError("--base says where the base of --arm stands; name the arm")
     if not all(abs(number) <= MAX_BASE for number in command.base):
         raise UsageError(f"--base {command.base}: X Y Z YAW are finite numbers, at most {MAX_BASE:g}: m and rad")
+    from adaafford.depth_images import Lens
     from adaafford.histories import TriedOutcome
     from adaafford.pretrained import load_policy, only_pretrained
     from adaafford.sessions import Session, SessionFiles
@@ -102,6 +113,11 @@ def main(args: list[str]) -> int:
 
     files = SessionFiles(command.history, command.out or command.history.parent / "heatmap.ply")
     policy = load_policy(command.policy or only_pretrained())
+    if command.pose is not None and command.intrinsics is None:
+        raise UsageError("--pose: says where the camera of a depth image stands; give its --intrinsics with it")
+    lens = None
+    if command.intrinsics is not None:
+        lens = parse(Lens, {"intrinsics": command.intrinsics, "pose": command.pose}, "--intrinsics and --pose")
     session = Session(
         policy,
         files,
@@ -110,9 +126,11 @@ def main(args: list[str]) -> int:
         command.up,
         command.camera,
         command.points,
-        _say,
-        None if command.arm is None else arm_of(command.arm),
-        command.base,
+        tell=_say,
+        arm=None if command.arm is None else arm_of(command.arm),
+        base=command.base,
+        part=command.part,
+        lens=lens,
     )
     told = {
         "motion": command.outcome,

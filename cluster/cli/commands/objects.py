@@ -1,4 +1,4 @@
-"""`adaafford objects`: generate, import, export, check, draw and decompose objects."""
+"""`adaafford objects`: generate, import, export, check, draw, decompose and scan objects."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -131,6 +131,25 @@ class DecomposeCommand:
 
     path: Annotated[Path, tyro.conf.Positional]
     """A folder of objects, or one object's folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScenesCommand:
+    """Make labelled scans of objects among other things, with the errors of a depth camera, for `train segmentation`.
+
+    The same command goes on where it was stopped.
+    """
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A folder of objects."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of the scenes: new, or of the same settings."""
+    count: Annotated[int, Field(ge=1, le=100_000)] = 1500
+    """Number of scenes; each object in turn, in a random order."""
+    noise: tuple[Annotated[float, Field(ge=0, le=10)], Annotated[float, Field(ge=0, le=10)]] = (0.3, 1.5)
+    """Least and greatest strength of the errors: 0 is none, 1 a structured-light camera one metre from the object."""
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Everything random derives from it."""
 
 
 def _generate(command: GenerateCommand) -> int:
@@ -310,6 +329,20 @@ def _decompose(command: DecomposeCommand) -> int:
     return 0 if failed < len(usable) else UsageError.exit_code
 
 
+def _scenes(command: ScenesCommand) -> int:
+    from collector.scenes import make_scenes
+    from shared.extras import require
+    from shared.progress import Progress
+
+    require("adaafford objects scenes", "collect", without=("ray",))
+    if command.noise[0] > command.noise[1]:
+        raise UsageError(f"--noise {command.noise[0]:g} {command.noise[1]:g}: needs the least strength first")
+    with Progress("scenes", command.count) as progress:
+        made = make_scenes(command.path, command.out, command.count, command.seed, command.noise, progress.show)
+    print(plain(f"{command.out}: {made.count} scenes of {len(made.objects)} objects"))
+    return 0
+
+
 def _parts(count: int) -> str:
     return f"{count} movable part{'' if count == 1 else 's'}"
 
@@ -322,6 +355,7 @@ ACTIONS: dict[str, Action] = {
     "preview": (PreviewCommand, _preview),
     "film": (FilmCommand, _film),
     "decompose": (DecomposeCommand, _decompose),
+    "scenes": (ScenesCommand, _scenes),
 }
 
 

@@ -59,8 +59,11 @@ class RehearseCommand:
     arm: str | None = None
     """The arm that carries the hand, as for `adapt`: what it cannot reach is answered by "unreachable". The scans are
     then in a frame whose origin is its base. Without --policy, standard error says how `adapt` is to be called."""
+    scene: bool = False
+    """Scans are raw: the object stands on a floor, perhaps before walls and among other things, and nothing is marked.
+    With --policy the session finds the part itself, as `adapt --part auto` does."""
     seed: int = 1
-    """Everything random derives from it: objects, hidden dynamics, camera, states, noise."""
+    """Everything random derives from it: objects, hidden dynamics, camera, states, noise, surroundings."""
 
 
 def main(args: list[str]) -> int:
@@ -120,8 +123,9 @@ def _robots(command: RehearseCommand, gripper: str) -> Iterator["SimulatedRobot"
             seed=command.seed,
             number=number,
             noise=command.noise,
-            marked=command.marked,
+            marked=command.marked and not command.scene,
             arm=command.arm,
+            scene=command.scene,
         )
         yield SimulatedRobot(environment, setting, folder)
 
@@ -143,14 +147,22 @@ def _follow(robot: "SimulatedRobot") -> int:
 
 def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy") -> bool:
     """A whole session with one robot; whether it succeeded."""
+    from adaafford.parts import AUTO
     from adaafford.sessions import Session, SessionFiles
     from cluster.evaluation.rehearsal import Goal, rehearse
     from shared.arms.arm import arm_of
 
     folder = robot.folder
     files = SessionFiles(folder / "history.json", folder / "heatmap.ply")
-    arm = None if command.arm is None else arm_of(command.arm)
-    session = Session(policy, files, command.budget, command.seed, arm=arm, base=robot.base or (0.0, 0.0, 0.0, 0.0))
+    session = Session(
+        policy,
+        files,
+        command.budget,
+        command.seed,
+        arm=None if command.arm is None else arm_of(command.arm),
+        base=robot.base or (0.0, 0.0, 0.0, 0.0),
+        part=AUTO if command.scene else None,
+    )
 
     def tell(step: "Step", request: "Request") -> None:
         assert request.outcome is not None, "an action has an outcome"

@@ -5,17 +5,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
+from pydantic import Field
 
 from cluster.config.flags import early_flags, layered, parse_flags
-from learner.settings import LearnerConfig
+from learner.settings import LearnerConfig, SegmentationConfig
 from shared.errors import UsageError
 from shared.policies.methods import BASELINES
 
 if TYPE_CHECKING:
     from learner.stages.jobs import StageJob, StageName
 
-ALTERNATE = "alternate"
-STAGES = ("prior", "aap", "aip", *BASELINES.names(), ALTERNATE)
+ALTERNATE, SEGMENTATION = "alternate", "segmentation"
+STAGES = ("prior", "aap", "aip", *BASELINES.names(), ALTERNATE, SEGMENTATION)
 USAGE = f"""usage: adaafford train {{{",".join(STAGES)}}} --store STORE --out RUN [--init RUN] [SETTINGS]
 
   prior      the Where2Act prior, from nothing
@@ -24,6 +25,8 @@ USAGE = f"""usage: adaafford train {{{",".join(STAGES)}}} --store STORE --out RU
   {", ".join(BASELINES.names())}
              baselines; the policy keeps what else it holds
   alternate  prior, aap and aip, and the last two again until validation improves no more
+  segmentation
+             finds the movable parts of raw scans; learns from --scenes (`adaafford objects scenes`), not from a store
 
 The same command again goes on where it was stopped. `torchrun --nproc-per-node N -m cluster train ...` shares each
 batch among N processes. `adaafford train prior --help` lists all settings."""
@@ -64,6 +67,21 @@ class TrainCommand(LearnerCommand):
     from its weights."""
 
 
+@dataclass(frozen=True, slots=True)
+class SegmentationCommand:
+    """Train the segmentation network from labelled scenes. Give the same command again to continue."""
+
+    scenes: Path
+    """Folder that `adaafford objects scenes` made."""
+    out: Path
+    """Folder for the network, its metrics and its checkpoint: new, or of the same training."""
+    settings: Annotated[SegmentationConfig, tyro.conf.arg(name="")] = SegmentationConfig()
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Of all randomness."""
+    threads: Annotated[int, Field(ge=1, le=1024)] | None = None
+    """Of PyTorch; unset: as many as it chooses. Bits may differ between numbers of threads."""
+
+
 Command = TypeVar("Command", bound=LearnerCommand)
 
 
@@ -93,6 +111,8 @@ def main(args: list[str]) -> int:
     if stage not in STAGES:
         given = f"'{stage}'" if args else stage
         raise UsageError(f"train needs one of {', '.join(STAGES)}; given {given}")
+    if stage == SEGMENTATION:
+        return _segmentation(parse_flags(SegmentationCommand, args[1:], "train segmentation"))
     command = parse_learner(TrainCommand, args[1:], f"train {stage}")
     from learner.alternation import Finished, alternate
     from learner.stages.jobs import run_stage
@@ -104,4 +124,15 @@ def main(args: list[str]) -> int:
             alternate(Finished(job), command.settings, used)
         else:
             run_stage(job, command.settings, used)
+    return 0
+
+
+def _segmentation(command: SegmentationCommand) -> int:
+    import torch
+
+    from learner.stages.segmentation import train_segmentation
+
+    if command.threads is not None:
+        torch.set_num_threads(command.threads)
+    train_segmentation(command.scenes, command.out, command.settings, command.seed)
     return 0

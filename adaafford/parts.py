@@ -1,0 +1,281 @@
+"""The movable part of a raw scan: found, chosen by confidence, by number or by a click, and followed from then on."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.optimize import linear_sum_assignment
+
+from adaafford.pretrained import PRETRAINED_FOLDER
+from adaafford.scans import MAX_COORDINATE, Scan, ScanFrame, Vector
+from shared.config import StrictModel
+from shared.errors import UsageError
+from shared.io.files import read_bounded
+from shared.policies.policy import MAX_WEIGHTS_BYTES, WEIGHTS_FILE
+from shared.segmentation.kinds import MOVABLE, Kind
+from shared.segmentation.segmenter import MAX_DOCUMENT_BYTES, SEGMENTATION_FILE, Part, Segmentation, Segmenter
+from shared.tasks import TASKS
+from shared.types import Float, Float32
+
+SEGMENTATION = "segmentation"
+"""Name of the bundled network."""
+AUTO = "auto"
+MAX_NUMBER = MAX_PARTS = 64
+CLICK_M = 0.05
+"""How far from a click a part may be."""
+FOLLOW_M = 0.4
+"""How far the middle of a part may move from one scan to the next."""
+PICTURE_POINTS = 60_000
+"""Of a raw scan, in the picture of its parts."""
+PARTS_SUFFIX = "-parts"
+"""Of the picture, beside the heatmap."""
+_CHOSEN, _OTHER, _BODY, _BACKGROUND = 1.0, 0.75, 0.5, 0.0
+"""Their values in the picture, which is coloured as a heatmap is."""
+
+
+@dataclass(frozen=True, slots=True)
+class PartChoice:
+    """Which part is wanted: the most confident one unless a field says otherwise.
+
+    Attributes:
+        number: in order of confidence, from 1.
+        point: on the part, in the frame of the scan.
+    """
+
+    number: int = 1
+    point: Vector | None = None
+
+    @classmethod
+    def of(cls, told: str) -> "PartChoice":
+        """The choice that "auto", "2" or "0.9,0.1,0.4" is.
+
+        Raises:
+            UsageError: it is none.
+        """
+        words = told.split(",")
+        try:
+            if told == AUTO:
+                return cls()
+            if len(words) == 1 and 1 <= int(told) <= MAX_NUMBER:
+                return cls(int(told))
+            x, y, z = (float(word) for word in words)
+            if max(abs(x), abs(y), abs(z)) <= MAX_COORDINATE:
+                return cls(point=(x, y, z))
+        except ValueError:
+            pass
+        raise UsageError(
+            f"--part {told[:60]}: give auto, a number from 1 to {MAX_NUMBER}, or a point on the part as X,Y,Z in "
+            "metres, in the frame of the scan"
+        )
+
+
+def part_choice(told: str) -> str:
+    """A choice as it is told, given back where it is one; raises as `PartChoice.of` does."""
+    PartChoice.of(told)
+    return told
+
+
+class FoundPart(StrictModel):
+    """A movable part that was found in a scan."""
+
+    number: int = Field(ge=1)
+    """In order of confidence, from 1; `--part` takes it."""
+    kind: Literal["turning", "sliding"]
+    confidence: float = Field(ge=0, le=1)
+    """The network's mean probability over the part's points that they are of a part of this kind."""
+    centre: Vector
+    """The middle of the points that are seen of it, frame of the scan."""
+    points: int
+    """How many points of the scan are of it."""
+
+
+class FollowedPart(StrictModel):
+    """What a history keeps of the parts of a scan, to find the same part again in the next."""
+
+    centre: Vector
+    """The middle of the part."""
+    others: Annotated[tuple[Vector, ...], Field(max_length=MAX_PARTS)] = ()
+    """The middles of the other parts."""
+
+
+class PartAnswer(StrictModel):
+    """Which part a step is about."""
+
+    chosen: FoundPart
+    alternatives: tuple[FoundPart, ...]
+
+    @property
+    def followed(self) -> FollowedPart:
+        """What a history keeps of it."""
+        return FollowedPart(centre=self.chosen.centre, others=tuple(part.centre for part in self.alternatives))
+
+
+@dataclass(frozen=True, slots=True)
+class CutOut:
+    """A raw scan with the object cut out and one part marked.
+
+    Attributes:
+        scan: of the object alone; `movable` marks the part.
+        answer: which part that is, and what the others are.
+        whole: the raw scan.
+        shades: [M], of all points of the raw scan: 1 on the part, 0.75 on others, 0.5 on the body, 0 elsewhere.
+    """
+
+    scan: Scan
+    answer: PartAnswer
+    whole: Scan
+    shades: Float32
+
+    def picture(self) -> tuple[Float, Float32, NDArray[np.uint32]]:
+        """Points of the raw scan, thinned, with their shades and their numbers, as heatmaps have them."""
+        kept = np.linspace(0, len(self.shades) - 1, min(PICTURE_POINTS, len(self.shades))).astype(np.int64)
+        rows = kept if self.whole.rows is None else self.whole.rows[kept]
+        return self.whole.points[kept], self.shades[kept], rows.astype(np.uint32)
+
+
+class PartFinder:
+    """Finds the parts of raw scans that a task acts on.
+
+    Args:
+        task: by name; of one that acts on turning parts alone, only these are found.
+        segmenter: the network; the bundled one unless given.
+    """
+
+    def __init__(self, task: str, segmenter: Segmenter | None = None) -> None:
+        self._segmenter = segmenter or bundled_segmenter()
+        turning_only = task in TASKS.names() and TASKS.get(task).revolute_only
+        self._kinds = (Kind.TURNING,) if turning_only else MOVABLE
+        self._last: tuple[Scan, Segmentation, tuple[Part, ...]] | None = None
+
+    def cut_out(
+        self, scan: Scan, up: Vector, camera: Vector, choice: str, followed: FollowedPart | None, source: str
+    ) -> CutOut:
+        """Cut the object out of a scan and mark one of its parts.
+
+        Args:
+            scan: a raw scan.
+            up: against gravity, frame of the scan.
+            camera: its position, frame of the scan.
+            choice: which part is wanted (see `PartChoice.of`).
+            followed: the parts of the scan before; the choice then counts no more.
+            source: the scan's name in messages.
+
+        Raises:
+            UsageError: no such part is found, or the points are marked already.
+        """
+        if scan.movable is not None:
+            raise UsageError(f"{source}: says itself which points are movable; leave out --part, or 'movable'")
+        found, parts = self._parts(scan, up, camera, source)
+        numbered = [
+            FoundPart(
+                number=number,
+                kind="turning" if part.kind is Kind.TURNING else "sliding",
+                confidence=round(part.confidence, 4),
+                centre=_vector(middle(scan.points[part.points])),
+                points=len(part.points),
+            )
+            for number, part in enumerate(parts, start=1)
+        ]
+        if followed is None:
+            chosen = _chosen(scan, parts, numbered, PartChoice.of(choice), source)
+        else:
+            chosen = _again(numbered, followed, source)
+        shades = np.full(len(scan.points), _BACKGROUND, dtype=np.float32)
+        shades[found.object] = _BODY
+        for part in parts:
+            shades[part.points] = _OTHER
+        shades[parts[chosen].points] = _CHOSEN
+        rows = found.object
+        cut = replace(
+            scan,
+            points=scan.points[rows],
+            normals=None if scan.normals is None else scan.normals[rows],
+            movable=shades[rows] == _CHOSEN,
+            rows=rows if scan.rows is None else scan.rows[rows],
+        )
+        others = tuple(part for number, part in enumerate(numbered) if number != chosen)
+        return CutOut(cut, PartAnswer(chosen=numbered[chosen], alternatives=others), scan, shades)
+
+    def _parts(self, scan: Scan, up: Vector, camera: Vector, source: str) -> tuple[Segmentation, tuple[Part, ...]]:
+        """What is in a scan; it is remembered until another scan comes."""
+        if self._last is None or self._last[0] is not scan:
+            frame = ScanFrame(up=up, camera=camera, origin=(0.0, 0.0, 0.0))
+            try:
+                found = self._segmenter.segment(frame.to_world(scan.points), frame.to_world([camera])[0])
+            except UsageError as error:
+                raise UsageError(f"{source}: {error}") from None
+            self._last = scan, found, tuple(part for part in found.parts if part.kind in self._kinds)[:MAX_PARTS]
+        _, found, parts = self._last
+        if not parts:
+            kinds = " or ".join(kind.name.lower() for kind in self._kinds)
+            raise UsageError(
+                f"{source}: no {kinds} part is found on the object; look from another side, or mark the points to act "
+                "on as 'movable' and leave out --part"
+            )
+        return found, parts
+
+
+@cache
+def bundled_segmenter() -> Segmenter:
+    """The bundled network."""
+    return read_segmenter(PRETRAINED_FOLDER / SEGMENTATION)
+
+
+def read_segmenter(folder: Path) -> Segmenter:
+    """A network from the folder that its training left; raises StoreError where a file is missing or damaged."""
+    limits = {WEIGHTS_FILE: MAX_WEIGHTS_BYTES, SEGMENTATION_FILE: MAX_DOCUMENT_BYTES}
+    return Segmenter.from_files({name: read_bounded(folder / name, limit) for name, limit in limits.items()})
+
+
+def middle(points: Float) -> Float:
+    """The middle of the box that holds points, [M, 3]."""
+    found: Float = (points.min(axis=0) + points.max(axis=0)) / 2
+    return found
+
+
+def _chosen(scan: Scan, parts: tuple[Part, ...], numbered: list[FoundPart], choice: PartChoice, source: str) -> int:
+    if choice.number > len(parts):
+        raise UsageError(f"{source}: --part {choice.number}: {_listed(numbered)}; give one of these numbers, or auto")
+    if choice.point is None:
+        return choice.number - 1
+    click = np.array(choice.point)
+    away = [float(np.linalg.norm(scan.points[part.points] - click, axis=1).min()) for part in parts]
+    nearest = int(np.argmin(away))
+    if not away[nearest] <= CLICK_M:
+        raise UsageError(
+            f"{source}: the point {_shown(choice.point)} is {away[nearest]:.2f} m from the nearest part that was "
+            f"found, and {CLICK_M:g} m is allowed; {_listed(numbered)}"
+        )
+    return nearest
+
+
+def _again(numbered: list[FoundPart], followed: FollowedPart, source: str) -> int:
+    """The part that was followed, where all parts together moved the least."""
+    before = np.array([followed.centre, *followed.others])
+    away = np.linalg.norm(before[:, None] - np.array([part.centre for part in numbered]), axis=2)
+    rows, columns = linear_sum_assignment(np.minimum(away, FOLLOW_M))
+    again = {int(row): int(column) for row, column in zip(rows, columns, strict=True)}
+    if 0 not in again or not away[0, again[0]] < FOLLOW_M:
+        raise UsageError(
+            f"{source}: the part that was at {_shown(followed.centre)} in the scan before is not found again; scan the "
+            f"object anew under another name, or begin another history. {_listed(numbered)}"
+        )
+    return again[0]
+
+
+def _listed(numbered: list[FoundPart]) -> str:
+    shown = [f"{part.number} at {_shown(part.centre)} ({part.confidence:.2f})" for part in numbered[:8]]
+    return f"parts found, with confidence: {'; '.join(shown)}{'; ...' if len(numbered) > 8 else ''}"
+
+
+def _shown(point: Vector) -> str:
+    return ",".join(f"{value:.2f}" for value in point)
+
+
+def _vector(point: Float) -> Vector:
+    x, y, z = (round(float(value), 4) for value in point)
+    return x, y, z

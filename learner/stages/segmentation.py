@@ -1,0 +1,158 @@
+"""The segmentation network, trained on labelled scenes (`adaafford objects scenes`)."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from learner.settings import SegmentationConfig
+from learner.training.loop import ParameterGroup, StepResult, TrainingResult, train
+from shared import seeds
+from shared.errors import UsageError
+from shared.io.files import make_folder, write_atomically
+from shared.networks.grouping import group_cloud
+from shared.networks.pointnet2 import CloudBatch
+from shared.networks.segmentation import SEGMENTATION_NETWORK, SegmentationNetwork
+from shared.segmentation.kinds import MOVABLE, Kind
+from shared.segmentation.scenes import Scene, read_scene, read_scenes_document, scene_path
+from shared.segmentation.segmenter import Segmenter, begun
+
+VALIDATION_SHARE = 8
+"""One object in so many is used for validation."""
+VALIDATION_SCENES = 48
+OFFSET_WEIGHT = 4.0
+"""Of the mean error of the offsets, m, beside the cross entropy."""
+KIND_WEIGHTS = (0.5, 1.0, 1.5, 1.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Scenes:
+    """Scenes as tensors.
+
+    Attributes:
+        clouds: of S scenes.
+        kinds: [S, N].
+        centres: [S, N, 3].
+    """
+
+    clouds: CloudBatch
+    kinds: Tensor
+    centres: Tensor
+
+    @classmethod
+    def of(cls, scenes: list[Scene]) -> "Scenes":
+        """Scenes stacked, with the neighbours of their points."""
+        points = [scene.points for scene in scenes]
+        clouds = CloudBatch.of(points, (group_cloud(each, SEGMENTATION_NETWORK) for each in points))
+        extra = torch.from_numpy(np.stack([scene.extra for scene in scenes]))
+        return cls(
+            CloudBatch(clouds.points, clouds.neighbours, clouds.nearest, extra),
+            torch.from_numpy(np.stack([scene.kinds for scene in scenes])),
+            torch.from_numpy(np.stack([scene.centres for scene in scenes])),
+        )
+
+    def select(self, numbers: Tensor) -> "Scenes":
+        """The scenes of some numbers."""
+        return Scenes(self.clouds.select(numbers), self.kinds[numbers], self.centres[numbers])
+
+    def mirrored(self, flips: Tensor) -> "Scenes":
+        """The scenes with those that are marked, [S], reflected at the plane y = 0."""
+        signs = torch.ones(len(flips), 1, 3)
+        signs[flips, :, 1] = -1.0
+        clouds = self.clouds
+        assert clouds.extra is not None, "scenes have further inputs"
+        # The first three further inputs are the normal.
+        extra = torch.cat([clouds.extra[..., :3] * signs, clouds.extra[..., 3:]], dim=-1)
+        turned = CloudBatch(clouds.points * signs, clouds.neighbours, clouds.nearest, extra)
+        return Scenes(turned, self.kinds, self.centres * signs)
+
+
+class SegmentationStage:
+    """Trains `SegmentationNetwork`: cross entropy of the kinds, and the distance of the voted from the true middles."""
+
+    name = "segmentation"
+
+    def __init__(self, network: SegmentationNetwork, learnt: Scenes, held_out: Scenes, config: SegmentationConfig):
+        self.module: nn.Module = network
+        self._network, self._learnt, self._held_out, self._config = network, learnt, held_out, config
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """All weights, at one rate."""
+        return [ParameterGroup(tuple(self.module.parameters()))]
+
+    def loss(self, rng: np.random.Generator) -> StepResult:
+        """The losses of a few scenes."""
+        count = min(self._config.batch_scenes, len(self._learnt.kinds))
+        scenes = self._learnt.select(torch.from_numpy(rng.permutation(len(self._learnt.kinds))[:count]))
+        if self._config.mirror:
+            scenes = scenes.mirrored(torch.from_numpy(rng.random(count) < 0.5))
+        kinds, offsets = self._losses(scenes, *self._network(scenes.clouds))
+        return StepResult({"kinds": kinds, "offsets": offsets}, count)
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """The losses on scenes of other objects, and the intersection over union of each kind; "score" is their sum."""
+        logits, offsets = [], []
+        for number in range(len(self._held_out.kinds)):
+            one_logits, one_offsets = self._network(self._held_out.select(torch.tensor([number])).clouds)
+            logits.append(one_logits)
+            offsets.append(one_offsets)
+        all_logits = torch.cat(logits)
+        kinds, distance = self._losses(self._held_out, all_logits, torch.cat(offsets))
+        guessed, figures = all_logits.argmax(dim=-1), {"score": float(kinds + distance)}
+        for kind in Kind:
+            both = ((guessed == kind) & (self._held_out.kinds == kind)).sum()
+            either = ((guessed == kind) | (self._held_out.kinds == kind)).sum()
+            figures[f"iou_{kind.name.lower()}"] = float(both / either.clamp_min(1))
+        figures["offset_m"] = float(distance / OFFSET_WEIGHT)
+        return figures
+
+    def _losses(self, scenes: Scenes, logits: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+        kinds = functional.cross_entropy(logits.flatten(0, 1), scenes.kinds.flatten(), torch.tensor(KIND_WEIGHTS))
+        moves = torch.isin(scenes.kinds, torch.tensor(MOVABLE))
+        off = torch.linalg.vector_norm(scenes.clouds.points + offsets - scenes.centres, dim=-1)[moves]
+        return kinds, OFFSET_WEIGHT * (off.sum() / max(len(off), 1))
+
+
+def train_segmentation(
+    folder: Path, out: Path, config: SegmentationConfig, seed: int
+) -> tuple[Segmenter, TrainingResult]:
+    """Train a segmentation network from scenes, or go on with it; its files are written to `out`.
+
+    Args:
+        folder: of scenes.
+        out: folder for the network, its metrics and its checkpoint.
+        config: how long, how fast.
+        seed: of all randomness.
+
+    Raises:
+        UsageError: there are no scenes, or too few objects to hold one out; or `out` is of another training.
+        StoreError: a scene is damaged.
+    """
+    document = read_scenes_document(folder)
+    objects = len(document.objects)
+    held_out = seeds.generator(seed, "segmentation/validation").permutation(objects)[: -(-objects // VALIDATION_SHARE)]
+    if len(held_out) == objects:
+        raise UsageError(f"{folder}: has scenes of one object; validation needs another")
+    numbers = np.arange(document.count)
+    validates = np.isin(numbers % objects, held_out)
+    if validates.all() or not validates.any():
+        raise UsageError(f"{folder}: has too few scenes; make more of them")
+
+    def read(chosen: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Scenes:
+        return Scenes.of([read_scene(scene_path(folder, int(number))) for number in chosen])
+
+    stage = SegmentationStage(
+        begun(seed), read(numbers[~validates]), read(numbers[validates][:VALIDATION_SCENES]), config
+    )
+    make_folder(out)
+    told = f"{document.model_dump_json()}{config.model_dump_json()}{seed}{SEGMENTATION_NETWORK.model_dump_json()}"
+    result = train(stage, config, seed, out, hashlib.sha256(told.encode()).hexdigest())
+    segmenter = Segmenter(stage._network)
+    for name, data in segmenter.to_files().items():
+        write_atomically(out / name, data)
+    return segmenter, result

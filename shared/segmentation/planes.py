@@ -1,0 +1,93 @@
+"""The floor and the walls of a scan: large planes with nothing behind them (RANSAC)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.types import Float
+
+TOLERANCE_M = 0.015
+"""What is so near a plane is on it; a depth camera errs by some millimetres."""
+HYPOTHESES, SAMPLE = 600, 2500
+"""Planes through three random points, and the random points on which they are judged."""
+MOST_TILT = 0.17
+"""A floor is level and a wall upright within asin of this, 10 deg."""
+BEHIND = 0.06
+"""The largest share of the points behind a floor or wall: what is seen over a wall, and what was measured wrongly."""
+LEAST_SHARE = 0.04
+"""The smallest share of the points on a floor or wall."""
+LEAST_WIDTH = 0.5
+"""A wall is at least as wide as this share of the scan, floor included; fronts of objects are narrower."""
+MOST_WALLS = 2
+
+
+def floor_and_walls(points: Float, camera: Float, rng: np.random.Generator) -> tuple[NDArray[np.bool_], float]:
+    """Which points are on, below or behind the floor and the walls.
+
+    Args:
+        points: [M, 3], z up.
+        camera: [3], in the same frame.
+        rng: draws hypotheses.
+
+    Returns:
+        [M], whether a point belongs to the floor or to a wall; and the height of the floor below the other points, or
+        the lowest height where there is no floor.
+    """
+    left = np.ones(len(points), dtype=bool)
+    floor = _plane(points, points, camera, rng, upright=False)
+    if floor is None:
+        return ~left, float(points[:, 2].min())
+    normal, offset = floor
+    left &= points @ normal - offset > TOLERANCE_M
+    if not left.any():
+        return ~left, offset
+    for _ in range(MOST_WALLS):
+        wall = _plane(points[left], points, camera, rng, upright=True)
+        if wall is None:
+            break
+        behind = points @ wall[0] - wall[1] <= TOLERANCE_M
+        if (left & behind).sum() == left.sum():
+            break
+        left &= ~behind
+    middle = np.median(points[left], axis=0)
+    return ~left, float((offset - normal[:2] @ middle[:2]) / normal[2])
+
+
+def _plane(
+    points: Float, scan: Float, camera: Float, rng: np.random.Generator, *, upright: bool
+) -> tuple[Float, float] | None:
+    """The floor of a scan, or a wall: its normal, [3], towards the camera, and its offset; None where there is none."""
+    if len(points) < 3:
+        return None
+    sample = points[rng.integers(len(points), size=min(SAMPLE, len(points)))]
+    corners = sample[rng.integers(len(sample), size=(HYPOTHESES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals /= lengths[:, None]
+        steep = np.abs(normals[:, 2])
+        fits = (lengths > 1e-6) & ((steep < MOST_TILT) if upright else (steep > np.sqrt(1 - MOST_TILT**2)))
+    normals, corners = normals[fits], corners[fits, 0]
+    normals *= np.sign((normals * (camera - corners)).sum(axis=1, keepdims=True))
+    heights = sample @ normals.T - (normals * corners).sum(axis=1)
+    on, behind = (np.abs(heights) <= TOLERANCE_M).mean(axis=0), (heights < -2 * TOLERANCE_M).mean(axis=0)
+    on = np.where((behind <= BEHIND) & (on >= LEAST_SHARE), on, 0.0)
+    if upright:
+        # Along the wall, level.
+        along = np.stack([-normals[:, 1], normals[:, 0]])
+        across, room = sample[:, :2] @ along, scan[rng.integers(len(scan), size=SAMPLE), :2] @ along
+        widths = [_width(across[np.abs(h) <= TOLERANCE_M, n]) if on[n] > 0 else 0.0 for n, h in enumerate(heights.T)]
+        on = np.where(np.array(widths) >= LEAST_WIDTH * np.ptp(np.percentile(room, [1, 99], axis=0), axis=0), on, 0.0)
+    if not on.any():
+        return None
+    normal, corner = normals[on.argmax()], corners[on.argmax()]
+    for _ in range(2):
+        near = points[np.abs((points - corner) @ normal) <= TOLERANCE_M]
+        corner = near.mean(axis=0)
+        fitted: Float = np.linalg.eigh(np.cov((near - corner).T))[1][:, 0]
+        normal = fitted * np.sign(fitted @ normal)
+    return normal, float(normal @ corner)
+
+
+def _width(places: Float) -> float:
+    """How far places on a line, [any], reach, but for outliers."""
+    return float(np.ptp(np.percentile(places, [1, 99])))

@@ -1,0 +1,223 @@
+"""The segmentation of a raw scan: floor and walls by geometry, the rest by a network, and parts from its votes.
+
+Shapes: M points of a scan, N points that the network is given.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from safetensors.torch import save
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from shared.config import StrictModel
+from shared.errors import StoreError, UsageError
+from shared.io.documents import parse_document
+from shared.networks.grouping import group_cloud
+from shared.networks.network_config import NetworkConfig
+from shared.networks.pointnet2 import CloudBatch
+from shared.networks.segmentation import SEGMENTATION_NETWORK, SegmentationNetwork
+from shared.policies.policy import MAX_WEIGHTS_BYTES, WEIGHTS_FILE, read_tensors
+from shared.segmentation.inputs import EXTRA, SegmentationInput, network_input
+from shared.segmentation.kinds import MOVABLE, Kind
+from shared.types import Float, Float32
+
+SEGMENTATION_FILE = "segmentation.json"
+MAX_DOCUMENT_BYTES = 1 << 16
+PEAK_M, APART_M = 0.06, 0.16
+"""Votes within the first are counted together; middles of two parts are at least as far apart as the second."""
+LEAST_VOTES = 12
+"""The fewest points of the network's input that make a part."""
+TOUCHING_M = 0.12
+"""Points of the network's input that are nearer to each other belong to one thing."""
+ABSORBED = 0.05
+"""A thing with a smaller share of the object's points than this is left out."""
+NEAREST = 3
+"""Points of the network's input whose labels a point of the scan takes the most frequent of."""
+
+
+class SegmentationDocument(StrictModel):
+    """The contents of segmentation.json."""
+
+    format: Literal["adaafford-segmentation"] = "adaafford-segmentation"
+    schema_version: Literal[1] = 1
+    network: NetworkConfig
+    weights_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A movable part that was found.
+
+    Attributes:
+        kind: how it moves.
+        points: [any], the points of the scan that are of it.
+        centre: [3], the middle of these points, frame of the scan.
+        confidence: mean probability of its kind over its points, in [0, 1].
+    """
+
+    kind: Kind
+    points: NDArray[np.int64]
+    centre: Float
+    confidence: float
+
+
+@dataclass(frozen=True, slots=True)
+class Segmentation:
+    """What was found in a scan.
+
+    Attributes:
+        object: [any], the points of the scan that are of the object.
+        parts: the most confident first.
+    """
+
+    object: NDArray[np.int64]
+    parts: tuple[Part, ...]
+
+
+class Segmenter:
+    """Segments raw scans.
+
+    Args:
+        network: trained.
+    """
+
+    def __init__(self, network: SegmentationNetwork) -> None:
+        self._network = network
+
+    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+        """Find the object in a scan, and its movable parts.
+
+        Args:
+            points: [M, 3], z up, metres.
+            camera: [3], in the same frame.
+            seed: of the random choices.
+
+        Raises:
+            UsageError: there is nothing but floor and walls, or no object.
+        """
+        given, _ = network_input(points, camera, seed)
+        probabilities, votes = self._evaluated(given)
+        kinds = probabilities.argmax(axis=1)
+        labels = part_labels(given.points, kinds, votes)
+        if not (labels >= 0).any():
+            raise UsageError("no object is seen in the scan; move the camera towards it")
+        spread = _spread(points[given.left], points[given.rows], labels)
+        parts = []
+        for label in range(1, labels.max() + 1):
+            mine = labels == label
+            kind = Kind(int(kinds[mine][0]))
+            rows = given.left[spread == label]
+            if len(rows):
+                centre = (points[rows].min(axis=0) + points[rows].max(axis=0)) / 2
+                parts.append(Part(kind, rows, centre, float(probabilities[mine, kind].mean())))
+        parts.sort(key=lambda part: -part.confidence)
+        return Segmentation(given.left[spread >= 0], tuple(parts))
+
+    @torch.no_grad()
+    def _evaluated(self, given: SegmentationInput) -> tuple[Float32, Float32]:
+        """Probabilities of the kinds, [N, kinds], and the middles that are voted for, [N, 3]."""
+        config = SEGMENTATION_NETWORK
+        clouds = CloudBatch.of([given.points], [group_cloud(given.points, config)])
+        extra = torch.from_numpy(given.extra)[None]
+        logits, offsets = self._network(CloudBatch(clouds.points, clouds.neighbours, clouds.nearest, extra))
+        return torch.softmax(logits[0], dim=-1).numpy(), given.points + offsets[0].numpy()
+
+    def to_files(self) -> dict[str, bytes]:
+        """The network as files, in half precision: weights.safetensors and segmentation.json."""
+        weights = save({name: tensor.half().contiguous() for name, tensor in self._network.state_dict().items()})
+        document = SegmentationDocument(
+            network=SEGMENTATION_NETWORK, weights_sha256=hashlib.sha256(weights).hexdigest()
+        )
+        return {WEIGHTS_FILE: weights, SEGMENTATION_FILE: document.model_dump_json(indent=1).encode() + b"\n"}
+
+    @classmethod
+    def from_files(cls, files: Mapping[str, bytes]) -> "Segmenter":
+        """Read a segmentation network, trusting nothing.
+
+        Raises:
+            StoreError: a file is missing, damaged, foreign or of another version.
+        """
+        data, weights = files.get(SEGMENTATION_FILE, b""), files.get(WEIGHTS_FILE, b"")
+        document = parse_document(SegmentationDocument, data, SEGMENTATION_FILE, "it is damaged or foreign")
+        if hashlib.sha256(weights).hexdigest() != document.weights_sha256 or len(weights) > MAX_WEIGHTS_BYTES:
+            raise StoreError(f"the SHA-256 of {WEIGHTS_FILE} is not that of {SEGMENTATION_FILE}; train it again")
+        if document.network != SEGMENTATION_NETWORK:
+            raise StoreError(f"{SEGMENTATION_FILE}: is of a network of other sizes; train it again")
+        network = begun(0)
+        network.load_state_dict(read_tensors(weights, network.state_dict(), WEIGHTS_FILE))
+        network.eval().requires_grad_(False)
+        return cls(network)
+
+
+def begun(seed: int) -> SegmentationNetwork:
+    """A network with random weights that depend on `seed` alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return SegmentationNetwork(SEGMENTATION_NETWORK, len(Kind), EXTRA)
+
+
+def part_labels(points: Float32, kinds: NDArray[np.int64], votes: Float32) -> NDArray[np.int64]:
+    """Of each of the network's points -1 for background, 0 for the object's body, n for the n-th part, [N]."""
+    labels = np.full(len(points), -1)
+    of_object = np.flatnonzero(kinds != Kind.BACKGROUND)
+    labels[of_object[_one_thing(points[of_object])]] = 0
+    found = 0
+    for kind in MOVABLE:
+        mine = np.flatnonzero((kinds == kind) & (labels == 0))
+        clusters = _clusters(votes[mine])
+        labels[mine[clusters >= 0]] = clusters[clusters >= 0] + 1 + found
+        found += clusters.max(initial=-1) + 1
+    return labels
+
+
+def _one_thing(points: Float32) -> NDArray[np.bool_]:
+    """Which points are of the largest thing, or of one of a size that counts beside it, [any]."""
+    if len(points) == 0:
+        return np.zeros(0, dtype=bool)
+    pairs = cKDTree(points).query_pairs(TOUCHING_M, output_type="ndarray")
+    graph = csr_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
+    _, things = connected_components(graph, directed=False, return_labels=True)
+    kept: NDArray[np.bool_] = (np.bincount(things) >= ABSORBED * len(points))[things]
+    return kept
+
+
+def _clusters(votes: Float32) -> NDArray[np.int64]:
+    """Numbers of the parts that votes are for, from 0, [any]; -1 for votes for what hardly any other votes for."""
+    numbers = np.full(len(votes), -1)
+    if len(votes) < LEAST_VOTES:
+        return numbers
+    tree = cKDTree(votes)
+    support = np.asarray(tree.query_ball_point(votes, PEAK_M, return_length=True))
+    left, peaks = np.ones(len(votes), dtype=bool), []
+    while left.any():
+        peak = int(np.where(left, support, -1).argmax())
+        if support[peak] < LEAST_VOTES:
+            break
+        near = tree.query_ball_point(votes[peak], PEAK_M)
+        middle = votes[near].mean(axis=0)
+        around = np.linalg.norm(votes - middle, axis=1) < APART_M
+        if (around & left).sum() >= LEAST_VOTES:
+            peaks.append(middle)
+        left &= ~around
+        left[peak] = False
+    if not peaks:
+        return numbers
+    return np.asarray(cKDTree(np.array(peaks)).query(votes)[1], dtype=np.int64)
+
+
+def _spread(points: Float, known: Float, labels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Labels of points, [any, 3], from those of some of them, [N, 3]."""
+    near = np.asarray(cKDTree(known).query(points, k=NEAREST)[1])
+    told = labels[near]
+    # The nearest counts unless the two others agree against it.
+    outvoted = (told[:, 1] == told[:, 2]) & (told[:, 0] != told[:, 1])
+    spread: NDArray[np.int64] = np.where(outvoted, told[:, 1], told[:, 0])
+    return spread

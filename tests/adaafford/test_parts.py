@@ -1,0 +1,189 @@
+"""The part of a raw scan: chosen in several ways, kept in the history, and followed where it moves."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adaafford import parts
+from adaafford.histories import TriedOutcome, read_history
+from adaafford.parts import PartChoice, PartFinder, read_segmenter
+from adaafford.scans import Scan, checked_scan
+from adaafford.sessions import Session, SessionFiles, parts_file
+from cluster.cli.main import run as adaafford
+from shared.errors import StoreError, UsageError
+from shared.policies.policy import CORE, WEIGHTS_FILE, Policy
+from shared.segmentation.kinds import Kind
+from shared.segmentation.segmenter import (
+    SEGMENTATION_FILE,
+    Part,
+    Segmentation,
+    Segmenter,
+    begun,
+    part_labels,
+)
+from shared.types import Float
+from tests.support.small_networks import TINY
+
+UP, CAMERA = (0.0, 0.0, 1.0), (0.0, 0.0, 1.0)
+TOLD = TriedOutcome(motion=0.2)
+
+
+class GivenSegmenter(Segmenter):
+    """Finds what stands out of a floor at z = 0: doors are what is left and right of y = 0, nearer than x = 1."""
+
+    def __init__(self) -> None:
+        super().__init__(begun(0))
+
+    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+        thing = points[:, 2] > 0.01
+        found = []
+        for side, confidence in ((1.0, 0.9), (-1.0, 0.7)):
+            mine = np.flatnonzero(thing & (points[:, 0] < 1.0) & (side * points[:, 1] > 0))
+            if len(mine):
+                found.append(Part(Kind.TURNING, mine, points[mine].mean(axis=0), confidence))
+        found.append(Part(Kind.SLIDING, np.flatnonzero(thing)[:100], np.zeros(3), 0.5))
+        return Segmentation(np.flatnonzero(thing), tuple(found))
+
+
+@pytest.fixture(autouse=True)
+def _given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts, "bundled_segmenter", GivenSegmenter)
+
+
+def room(left: float = 0.9, right: float = 0.9) -> Float:
+    """A floor, and on it a cabinet with two doors, at these distances."""
+    rng = np.random.default_rng(1)
+    floor = np.concatenate([rng.uniform(-3, 3, (3000, 2)), np.zeros((3000, 1))], axis=1)
+    body = rng.uniform([1.01, -0.3, 0.02], [1.3, 0.3, 0.8], (2000, 3))
+    doors = [rng.uniform([x, y, 0.1], [x + 0.02, y + 0.25, 0.7], (1500, 3)) for x, y in ((left, 0.02), (right, -0.27))]
+    return np.concatenate([floor, body, *doors])
+
+
+def write(path: Path, points: Float) -> Path:
+    np.savez(path, points=points, camera=np.array(CAMERA))
+    return path
+
+
+def session(folder: Path, part: str | None = "auto") -> Session:
+    files = SessionFiles(folder / "history.json", folder / "heatmap.npz")
+    policy = Policy.untrained("pull-closed-door", TINY, 0)
+    for name in CORE:
+        policy.with_trained(name)
+    return Session(policy, files, part=part, points=256)
+
+
+def test_a_choice_is_auto_a_number_or_a_click() -> None:
+    assert PartChoice.of("auto") == PartChoice(1)
+    assert PartChoice.of("3") == PartChoice(3)
+    assert PartChoice.of("0.5,-1,2e-1") == PartChoice(1, (0.5, -1.0, 0.2))
+    for wrong in ("", "0", "65", "-1", "best", "1,2", "1,2,3,4", "nan,0,0", "inf,0,0", "1e9,0,0"):
+        with pytest.raises(UsageError, match="give auto, a number"):
+            PartChoice.of(wrong)
+
+
+@pytest.mark.parametrize(("part", "side"), [("auto", 1), ("1", 1), ("2", -1), ("0.9,-0.1,0.4", -1)])
+def test_the_part_that_is_asked_for_is_acted_on(part: str, side: int, tmp_path: Path) -> None:
+    step = session(tmp_path, part).step(write(tmp_path / "scan-1.npz", room()))
+    assert step.part is not None
+    assert step.part.chosen.kind == "turning"
+    assert side * step.part.chosen.centre[1] > 0 and side * step.point[1] > 0
+    assert len(step.part.alternatives) == 1, "what slides is not of this task"
+    assert read_history(tmp_path / "history.json").part == part
+    shades = np.load(parts_file(tmp_path / "heatmap.npz"))
+    chosen = shades["points"][shades["affordance"] == 1.0]
+    assert len(chosen) and (side * chosen[:, 1] > 0).all()
+
+
+def test_the_part_is_followed_where_it_moved_to(tmp_path: Path) -> None:
+    first = write(tmp_path / "scan-1.npz", room())
+    begun_session = session(tmp_path, "2")
+    once = begun_session.step(first)
+    assert begun_session.step(first).model_copy(update={"seconds": once.seconds}) == once
+    assert session(tmp_path, None).step(first).model_copy(update={"seconds": once.seconds}) == once, "without --part"
+    second = write(tmp_path / "scan-2.npz", room(right=0.7))
+    later = session(tmp_path, "2").step(second, TOLD, 1)
+    assert later.tries == 1 and later.part is not None
+    assert later.part.chosen.centre[0] == pytest.approx(0.71, abs=0.02)
+    again = session(tmp_path, None).step(second, TOLD, 1)
+    assert again.model_copy(update={"seconds": later.seconds}) == later
+    history = read_history(tmp_path / "history.json")
+    assert [each.part is not None for each in history.interactions] == [True, True]
+
+
+def test_another_part_may_be_chosen_until_something_was_tried(tmp_path: Path) -> None:
+    scan = write(tmp_path / "scan-1.npz", room())
+    session(tmp_path, "auto").step(scan)
+    other = session(tmp_path, "2").step(scan)
+    assert other.part is not None and other.part.chosen.number == 2
+    session(tmp_path, "2").step(scan, TOLD, 1)
+    with pytest.raises(UsageError, match="begun with another part, 2"):
+        session(tmp_path, "auto").step(scan)
+
+
+def test_what_cannot_be_found_is_said_in_one_line(tmp_path: Path) -> None:
+    scan = write(tmp_path / "scan-1.npz", room())
+    for part, expected in (("3", "parts found, with confidence: 1 at"), ("5,5,5", "from the nearest part")):
+        with pytest.raises(UsageError, match=expected):
+            session(tmp_path, part).step(scan)
+        assert not (tmp_path / "history.json").exists()
+    session(tmp_path, "2").step(scan)
+    gone = room()
+    with pytest.raises(UsageError, match="is not found again"):
+        session(tmp_path, None).step(write(tmp_path / "scan-3.npz", room(right=1.5)), TOLD, 1)
+    with pytest.raises(UsageError, match="no turning part"):
+        session(tmp_path, None).step(write(tmp_path / "scan-4.npz", gone[gone[:, 0] > 1.0]), TOLD, 1)
+    assert read_history(tmp_path / "history.json").tried == ()
+
+
+def test_a_marked_scan_and_a_history_without_part_are_refused(tmp_path: Path) -> None:
+    marked = checked_scan(room(), movable=np.ones(len(room())))
+    with pytest.raises(UsageError, match="leave out --part"):
+        PartFinder("push").cut_out(marked, UP, CAMERA, "auto", None, "scan")
+    object_alone = room()[3000:]
+    session(tmp_path, None).step(write(tmp_path / "scan-1.npz", object_alone))
+    with pytest.raises(UsageError, match="begun without a part"):
+        session(tmp_path, "auto").step(tmp_path / "scan-1.npz")
+
+
+def test_a_task_that_acts_on_all_parts_finds_what_slides() -> None:
+    scan = Scan(room())
+    cut = PartFinder("push").cut_out(scan, UP, CAMERA, "3", None, "scan")
+    assert cut.answer.chosen.kind == "sliding"
+    assert cut.scan.movable is not None and cut.scan.movable.sum() == 100
+
+
+def test_the_command_says_which_part(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = write(tmp_path / "scan.npz", room())
+    flags = ["--cloud", str(scan), "--history", str(tmp_path / "h.json"), "--policy", "pull-closed-door"]
+    assert adaafford(["adapt", *flags, "--part", "auto"]) == 0
+    assert json.loads(capsys.readouterr().out)["part"]["chosen"]["confidence"] == 0.9
+    assert adaafford(["adapt", *flags, "--part", "none"]) == 2
+    assert "give auto, a number" in capsys.readouterr().err
+
+
+def test_doors_side_by_side_come_apart_and_stray_votes_do_not_count() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform([0, -0.8, 0], [0.02, 0.8, 1.0], (1200, 3)).astype(np.float32)
+    kinds = np.full(1200, Kind.TURNING)
+    middles = np.where(points[:, 1:2] > 0, [[0.01, 0.4, 0.5]], [[0.01, -0.4, 0.5]])
+    votes = (middles + 0.03 * rng.standard_normal((1200, 3))).astype(np.float32)
+    labels = part_labels(points, kinds, votes)
+    assert set(labels) == {1, 2}
+    assert len(set(labels[points[:, 1] > 0])) == len(set(labels[points[:, 1] < 0])) == 1
+    far = np.concatenate([points, points[:20] + 5.0])
+    assert (part_labels(far, np.full(1220, Kind.TURNING), np.concatenate([votes, far[1200:]]))[1200:] == -1).all()
+
+
+def test_a_network_comes_back_and_damage_is_refused(tmp_path: Path) -> None:
+    files = Segmenter(begun(1).eval()).to_files()
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    read_segmenter(tmp_path)
+    (tmp_path / WEIGHTS_FILE).write_bytes(files[WEIGHTS_FILE][:-1])
+    with pytest.raises(StoreError, match="SHA-256"):
+        read_segmenter(tmp_path)
+    (tmp_path / SEGMENTATION_FILE).write_bytes(b"{}")
+    with pytest.raises(StoreError):
+        read_segmenter(tmp_path)
