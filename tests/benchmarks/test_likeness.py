@@ -18,7 +18,8 @@ def drawn(seed: int, shift: float) -> np.ndarray:
     return (np.random.default_rng(seed).normal(size=(len(OBJECTS), 5)) + shift).astype(np.float32)
 
 
-def test_profiles_of_one_kind_cannot_be_told_apart_and_others_can() -> None:
+def test_profiles_of_one_kind_cannot_be_told_apart_and_others_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(likeness, "STEPS", 60)
     real = drawn(0, 0.0)
     assert told_apart(real, OBJECTS, drawn(1, 0.0), OBJECTS, seed=0) == pytest.approx(0.5, abs=0.08)
     assert told_apart(real, OBJECTS, drawn(1, 2.0), OBJECTS, seed=0) > 0.95
@@ -26,7 +27,10 @@ def test_profiles_of_one_kind_cannot_be_told_apart_and_others_can() -> None:
     assert nearest_ratio(real, OBJECTS, drawn(1, 2.0)) > 1.5
 
 
-def test_the_benchmark_compares_two_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_benchmark_compares_two_folders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(likeness, "STEPS", 60)
     for name, seed in (("real", 1), ("made", 2)):
         procedural.generate(tmp_path / name, {"Faucet": 5}, seed)
 
