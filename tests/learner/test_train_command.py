@@ -110,7 +110,7 @@ def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, tmp_p
 
     def train(stage: StageName, init: str | None = None) -> None:
         job = StageJob(stage, store, tmp_path / stage, None if init is None else tmp_path / init)
-        child.run("learner.stages.jobs:run_from_json", as_json(job, FAST), job.out)
+        child.run("learner.stages.jobs:run_from_json", as_json(job, FAST.model_copy(update={"threads": 1})), job.out)
 
     with closing(Child(lines.append)) as child:
         train("prior")
