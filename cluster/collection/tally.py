@@ -4,7 +4,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from shared.progress import Progress
@@ -85,10 +84,8 @@ class CollectionProgress(Progress):
         self._recent: deque[tuple[float, int]] = deque(maxlen=MAX_RECENT)
         """When job results came, and of how many interactions."""
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        super().__exit__(kind, error, traceback)
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
         if self.tally.rollouts:
             empty = describe_empty(self.tally.empty)
             self.say("; ".join([f"{self.title}: {self.describe()}", *([empty] if empty else [])]))

@@ -12,7 +12,6 @@ import json
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -52,9 +51,7 @@ class Decomposer:
     def __enter__(self) -> "Decomposer":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._child.close()
 
     def decomposed(

@@ -10,11 +10,14 @@ from hypothesis import strategies as st
 from cluster.campaign.campaign import steps_of
 from cluster.campaign.estimate import RATES, Estimate, Rates, StageCost, estimate, multiply_adds
 from cluster.cli.main import run as adaafford
-from cluster.config.campaign_config import CampaignConfig, RolloutCounts
+from cluster.config.campaign_config import CampaignConfig, RolloutCounts, SplitConfig
 from cluster.config.flags import layered
+from collector.objects.catalogue import for_task, scan, split
+from collector.objects.procedural import generate
 from learner.alternation import Publish
 from shared.networks.network_config import NETWORKS
 from shared.policies.methods import METHODS
+from shared.tasks import task_named
 
 KEEP = "--collection.camera.keep-depth"
 RATE_VALUES = {name: rate for name, rate in dataclasses.asdict(RATES).items() if name != "measured"}
@@ -144,7 +147,10 @@ def test_a_run_needs_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
     assert "needs --out FOLDER" in capsys.readouterr().err
 
 
-@pytest.mark.real_objects
-def test_the_objects_of_a_folder_are_counted_as_they_will_be_split(real_objects: Path) -> None:
-    found = estimate(CampaignConfig(task="push-faucet", objects=real_objects))
-    assert sum(found.objects) >= 2
+def test_the_objects_of_a_folder_are_counted_as_they_will_be_split(tmp_path: Path) -> None:
+    generate(tmp_path, {"Faucet": 8, "Box": 1}, seed=1)
+    found = estimate(CampaignConfig(task="push-faucet", objects=tmp_path))
+    entries = for_task(scan(tmp_path), task_named("push-faucet")).usable
+    parts = split([entry.ref for entry in entries], SplitConfig().fractions, CampaignConfig().seed)
+    assert found.objects == (len(parts.train), len(parts.validation), len(parts.test))
+    assert sum(found.objects) == 8

@@ -93,14 +93,10 @@ sys.meta_path.insert(0, Refuse())
 
 def test_it_trains_without_ray_and_sapien(store: Path, config_file: Path, tmp_path: Path) -> None:
     arguments = ["prior", "--store", str(store), "--out", str(tmp_path / "out"), "--config", str(config_file)]
-    out, err = train_process([*arguments, "--prior.steps", "3"], REFUSE).communicate(timeout=100)
+    out, err = train_process([*arguments, "--prior.steps", "1"], REFUSE).communicate(timeout=100)
     assert (err, out.splitlines()[0]) == ("", "device: cpu (1 thread)")
     assert f"leaves {WEIGHTS_FILE}, {POLICY_FILE} and {METRICS_FILE} in {tmp_path / 'out'}" in out
     assert (tmp_path / "out" / WEIGHTS_FILE).is_file()
-
-
-def train_in(child: Child, job: StageJob) -> None:
-    child.run("learner.stages.jobs:run_from_json", as_json(job, EAGER), job.out)
 
 
 def learners() -> list[psutil.Process]:
@@ -114,7 +110,7 @@ def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, tmp_p
 
     def train(stage: StageName, init: str | None = None) -> None:
         job = StageJob(stage, store, tmp_path / stage, None if init is None else tmp_path / init)
-        train_in(child, job)
+        child.run("learner.stages.jobs:run_from_json", as_json(job, FAST.model_copy(update={"threads": 1})), job.out)
 
     with closing(Child(lines.append)) as child:
         train("prior")
@@ -133,13 +129,17 @@ def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, tmp_p
         assert set(told.splitlines()) <= {without_places(line, tmp_path / stage) for line in lines}
 
 
-def test_a_learner_that_is_killed_ends_the_stage(store: Path, tmp_path: Path) -> None:
+def test_a_learner_that_is_killed_ends_the_stage(tmp_path: Path) -> None:
+    """Whatever it does; here, something that it begins sooner than a training."""
+    (tmp_path / "long.py").write_text("import time\nprint('begun', flush=True)\ntime.sleep(100)\n")
+
     def kill(line: str) -> None:
+        assert line == "begun"
         for child in learners():
             child.kill()
 
     with closing(Child(kill)) as child, pytest.raises(WorkerError, match=rf"{tmp_path} ended with code -9"):
-        train_in(child, StageJob("prior", store, tmp_path))
+        child.run("runpy:run_path", {"path_name": str(tmp_path / "long.py")}, tmp_path)
 
 
 def test_a_job_is_the_same_after_its_way_to_the_trainer(store: Path, tmp_path: Path) -> None:

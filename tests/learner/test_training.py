@@ -62,6 +62,24 @@ def fresh(dataset: Dataset, seed: int = 0, config: NetworkConfig = TINY) -> tupl
     return policy, FrozenFeatures.with_pool(dataset, np.random.default_rng(0))
 
 
+Weights = dict[str, torch.Tensor]
+"""Of a network, by name."""
+
+
+@pytest.fixture(scope="module")
+def aap_of_coins(coin_dataset: Dataset) -> Weights:
+    """Of an AAP that has learnt to read a try, for all tests of what comes after it."""
+    policy, known = fresh(coin_dataset)
+    descend(AapStage(policy.aap, known, EVERYTHING, AapConfig(context=4, batch_rollouts=8)), 40)
+    return {name: tensor.clone() for name, tensor in policy.aap.state_dict().items()}
+
+
+def after_aap(dataset: Dataset, weights: Weights) -> tuple[Policy, FrozenFeatures]:
+    policy, known = fresh(dataset)
+    policy.aap.load_state_dict(weights)
+    return policy, known
+
+
 def test_each_loss_of_the_prior_can_be_driven_down(dataset: Dataset) -> None:
     policy, _ = fresh(dataset)
     config = PriorConfig(proposals=20, batch_clouds=3)
@@ -110,10 +128,10 @@ def test_the_oracle_knows_and_aap_learns_from_it(coin_dataset: Dataset) -> None:
 
 
 @pytest.mark.parametrize("training", ["paper", "inherited"])
-def test_each_loss_of_aip_can_be_driven_down(coin_dataset: Dataset, training: Literal["paper", "inherited"]) -> None:
-    policy, known = fresh(coin_dataset)
-    config = AapConfig(context=4, batch_rollouts=8)
-    descend(AapStage(policy.aap, known, EVERYTHING, config), 40)
+def test_each_loss_of_aip_can_be_driven_down(
+    coin_dataset: Dataset, aap_of_coins: Weights, training: Literal["paper", "inherited"]
+) -> None:
+    policy, known = after_aap(coin_dataset, aap_of_coins)
     frozen = FrozenAap.of(policy.aap, known)
     stage = AipStage(
         policy.aip, coin_dataset, EVERYTHING, AipConfig(training=training, batch_rollouts=4, draws=2), frozen
@@ -140,10 +158,9 @@ def critics(policy: Policy, known: FrozenFeatures) -> dict[str, tuple[Critic, Fr
 @pytest.mark.parametrize("loss", ["mean", "published"])
 @pytest.mark.parametrize("module", ["prior", "aap", "aip"])
 def test_an_affordance_network_follows_its_critic_and_nothing_else_moves(
-    coin_dataset: Dataset, module: str, loss: Literal["mean", "published"]
+    coin_dataset: Dataset, aap_of_coins: Weights, module: str, loss: Literal["mean", "published"]
 ) -> None:
-    policy, known = fresh(coin_dataset)
-    descend(AapStage(policy.aap, known, EVERYTHING, AapConfig(context=4, batch_rollouts=8)), 40)
+    policy, known = after_aap(coin_dataset, aap_of_coins)
     critic, frozen = critics(policy, known)[module]
     config = AffordanceConfig(loss=loss, proposals=20, questions=640, points=64)
     pool, rng = ProposalPool.of(policy.prior, known), np.random.default_rng(0)
@@ -159,9 +176,8 @@ def test_an_affordance_network_follows_its_critic_and_nothing_else_moves(
     assert figures["affordance_rank_correlation"] > 0.5
 
 
-def test_the_curve_falls_where_tries_tell_and_greedy_beats_chance(coin_dataset: Dataset) -> None:
-    policy, known = fresh(coin_dataset)
-    descend(AapStage(policy.aap, known, EVERYTHING, AapConfig(context=4, batch_rollouts=8)), 40)
+def test_the_curve_falls_where_tries_tell_and_greedy_beats_chance(coin_dataset: Dataset, aap_of_coins: Weights) -> None:
+    policy, known = after_aap(coin_dataset, aap_of_coins)
     frozen = FrozenAap.of(policy.aap, known)
     rollouts = EVERYTHING.validation
     candidates = Candidates.of(coin_dataset, rollouts, draws=2, seed=0)
@@ -215,9 +231,10 @@ def test_aip_chooses_each_candidate_once_and_the_best_by_its_critic(coin_dataset
     assert torch.equal(again, made[:, :2])
 
 
-def test_tries_by_information_leave_aap_as_sure_as_it_expects_to_be(coin_dataset: Dataset) -> None:
-    policy, known = fresh(coin_dataset)
-    descend(AapStage(policy.aap, known, EVERYTHING, AapConfig(context=4, batch_rollouts=8)), 40)
+def test_tries_by_information_leave_aap_as_sure_as_it_expects_to_be(
+    coin_dataset: Dataset, aap_of_coins: Weights
+) -> None:
+    policy, known = after_aap(coin_dataset, aap_of_coins)
     frozen, aap, rows = FrozenAap.of(policy.aap, known), policy.aap, coin_dataset.rows
     candidates = Candidates.of(coin_dataset, EVERYTHING.validation, draws=1, seed=0).rows
     made = tries_by_information(known, candidates, frozen, 3)

@@ -1,7 +1,7 @@
 """Processes that write a store at once, or are killed while they do; run as a script by tests.
 
 It forks before any library has started a thread, which a test process cannot promise. Only what starts none is done
-before: Arrow imports pandas, where that is installed, at the first array that it makes.
+before: Zarr is imported, and Arrow imports pandas, where that is installed, at the first array that it makes.
 """
 
 import os
@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow as pa
+import zarr.codecs
+import zarr.storage  # noqa: F401 - once, and not in each child.
 
 from shared.plan import Job, Plan
 from shared.records import RolloutRecord

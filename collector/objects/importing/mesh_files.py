@@ -1,7 +1,6 @@
 """Mesh files of the formats that are imported: OBJ and STL by this project, COLLADA, glTF and PLY by trimesh."""
 
 from pathlib import PurePosixPath
-from types import TracebackType
 
 import numpy as np
 
@@ -33,9 +32,7 @@ class MeshParser:
     def __enter__(self) -> "MeshParser":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._child.close()
 
     def parse(self, data: bytes, name: str) -> Mesh:
