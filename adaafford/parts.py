@@ -86,7 +86,8 @@ class FoundPart(StrictModel):
     """In order of confidence, from 1; `--part` takes it."""
     kind: Literal["turning", "sliding"]
     confidence: float = Field(ge=0, le=1)
-    """The network's mean probability over the part's points that they are of a part of this kind."""
+    """The network's mean probability over the part's points that they are of a part of this kind, less for a part of
+    few points."""
     centre: Vector
     """The middle of the points that are seen of it, frame of the scan."""
     points: int
