@@ -32,7 +32,7 @@ from shared.types import Float, Float32
 
 SEGMENTATION_FILE = "segmentation.json"
 MAX_DOCUMENT_BYTES = 1 << 16
-PEAK_M, APART_M = 0.08, 0.2
+PEAK_M, APART_M = 0.12, 0.3
 """Votes within the first are counted together; those within the second of a maximum are for the same middle."""
 JOINED = 0.35
 """Clusters whose middles are nearer than this share of the extent of both together are one part."""
@@ -118,9 +118,9 @@ class Segmenter:
         parts = []
         for label in range(1, labels.max() + 1):
             mine = labels == label
-            kind = Kind(int(kinds[mine][0]))
             rows = given.left[spread == label]
-            if len(rows):
+            if mine.any() and len(rows):
+                kind = max(MOVABLE, key=lambda kind: float(probabilities[mine, kind].sum()))
                 centre = (points[rows].min(axis=0) + points[rows].max(axis=0)) / 2
                 share = mine.sum() / (mine.sum() + FEW_POINTS)
                 parts.append(Part(kind, rows, centre, float(share * probabilities[mine, kind].mean())))
@@ -175,12 +175,8 @@ def part_labels(points: Float32, kinds: NDArray[np.int64], votes: Float32) -> ND
     labels = np.full(len(points), -1)
     of_object = np.flatnonzero(kinds != Kind.BACKGROUND)
     labels[of_object[_one_thing(points[of_object])]] = 0
-    found = 0
-    for kind in MOVABLE:
-        mine = np.flatnonzero((kinds == kind) & (labels == 0))
-        clusters = _clusters(points[mine], votes[mine])
-        labels[mine[clusters >= 0]] = clusters[clusters >= 0] + 1 + found
-        found += clusters.max(initial=-1) + 1
+    mine = np.flatnonzero(np.isin(kinds, MOVABLE) & (labels == 0))
+    labels[mine] = _clusters(points[mine], votes[mine]) + 1
     return labels
 
 
