@@ -64,13 +64,11 @@ class Part:
     Attributes:
         kind: how it moves.
         points: [any], the points of the scan that are of it.
-        centre: [3], the middle of these points, frame of the scan.
         confidence: mean probability of its kind over its points, less for a part of few points; in [0, 1].
     """
 
     kind: Kind
     points: NDArray[np.int64]
-    centre: Float
     confidence: float
 
 
@@ -121,9 +119,8 @@ class Segmenter:
             rows = given.left[spread == label]
             if mine.any() and len(rows):
                 kind = max(MOVABLE, key=lambda kind: float(probabilities[mine, kind].sum()))
-                centre = (points[rows].min(axis=0) + points[rows].max(axis=0)) / 2
                 share = mine.sum() / (mine.sum() + FEW_POINTS)
-                parts.append(Part(kind, rows, centre, float(share * probabilities[mine, kind].mean())))
+                parts.append(Part(kind, rows, float(share * probabilities[mine, kind].mean())))
         parts.sort(key=lambda part: -part.confidence)
         return Segmentation(given.left[spread >= 0], tuple(parts))
 

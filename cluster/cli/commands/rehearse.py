@@ -12,6 +12,7 @@ from cluster.config.flags import parse_flags
 from shared.errors import UsageError
 from shared.extras import require
 from shared.io.files import make_folder
+from shared.io.text import plain
 
 if TYPE_CHECKING:
     from adaafford.sessions import Request, Step
@@ -137,7 +138,7 @@ def _follow(robot: "SimulatedRobot") -> int:
 
 def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy") -> bool:
     """A whole session with one robot; whether it succeeded."""
-    from adaafford.parts import AUTO
+    from adaafford.parts import AUTO, PartError
     from adaafford.sessions import Session, SessionFiles
     from cluster.evaluation.rehearsal import Goal, rehearse
 
@@ -155,7 +156,11 @@ def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy")
         )
 
     goal = None if command.goal is None else Goal(command.goal, command.within, command.repeat)
-    return rehearse(robot, session, tell, goal)
+    try:
+        return rehearse(robot, session, tell, goal)
+    except PartError as error:
+        print(plain(f"{folder.name} given up: {error}"), flush=True)
+        return False
 
 
 def _summary(command: RehearseCommand, ended: list[bool]) -> str:
