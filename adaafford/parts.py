@@ -37,6 +37,10 @@ _CHOSEN, _OTHER, _BODY, _BACKGROUND = 1.0, 0.75, 0.5, 0.0
 """Their values in the picture, which is coloured as a heatmap is."""
 
 
+class PartError(UsageError):
+    """No such part is found in a scan; another scan may show it."""
+
+
 @dataclass(frozen=True, slots=True)
 class PartChoice:
     """Which part is wanted: the most confident one unless a field says otherwise.
@@ -86,9 +90,10 @@ class FoundPart(StrictModel):
     """In order of confidence, from 1; `--part` takes it."""
     kind: Literal["turning", "sliding"]
     confidence: float = Field(ge=0, le=1)
-    """The network's mean probability over the part's points that they are of a part of this kind."""
+    """The network's mean probability over the part's points that they are of a part of this kind, less for a part of
+    few points."""
     centre: Vector
-    """The middle of the points that are seen of it, frame of the scan."""
+    """The median of the points that are seen of it, frame of the scan."""
     points: int
     """How many points of the scan are of it."""
 
@@ -165,7 +170,8 @@ class PartFinder:
             source: the scan's name in messages.
 
         Raises:
-            UsageError: no such part is found, or the points are marked already.
+            PartError: no such part is found.
+            UsageError: the choice has no such number or point, or the points are marked already.
         """
         if scan.movable is not None:
             raise UsageError(f"{source}: says itself which points are movable; leave out --part, or 'movable'")
@@ -175,7 +181,7 @@ class PartFinder:
                 number=number,
                 kind="turning" if part.kind is Kind.TURNING else "sliding",
                 confidence=round(part.confidence, 4),
-                centre=_vector(middle(scan.points[part.points])),
+                centre=_vector(np.median(scan.points[part.points], axis=0)),
                 points=len(part.points),
             )
             for number, part in enumerate(parts, start=1)
@@ -207,12 +213,12 @@ class PartFinder:
             try:
                 found = self._segmenter.segment(frame.to_world(scan.points), frame.to_world([camera])[0])
             except UsageError as error:
-                raise UsageError(f"{source}: {error}") from None
+                raise PartError(f"{source}: {error}") from None
             self._last = scan, found, tuple(part for part in found.parts if part.kind in self._kinds)[:MAX_PARTS]
         _, found, parts = self._last
         if not parts:
             kinds = " or ".join(kind.name.lower() for kind in self._kinds)
-            raise UsageError(
+            raise PartError(
                 f"{source}: no {kinds} part is found on the object; look from another side, or mark the points to act "
                 "on as 'movable' and leave out --part"
             )
@@ -229,12 +235,6 @@ def read_segmenter(folder: Path) -> Segmenter:
     """A network from the folder that its training left; raises StoreError where a file is missing or damaged."""
     limits = {WEIGHTS_FILE: MAX_WEIGHTS_BYTES, SEGMENTATION_FILE: MAX_DOCUMENT_BYTES}
     return Segmenter.from_files({name: read_bounded(folder / name, limit) for name, limit in limits.items()})
-
-
-def middle(points: Float) -> Float:
-    """The middle of the box that holds points, [M, 3]."""
-    found: Float = (points.min(axis=0) + points.max(axis=0)) / 2
-    return found
 
 
 def _chosen(scan: Scan, parts: tuple[Part, ...], numbered: list[FoundPart], choice: PartChoice, source: str) -> int:
@@ -260,7 +260,7 @@ def _again(numbered: list[FoundPart], followed: FollowedPart, source: str) -> in
     rows, columns = linear_sum_assignment(np.minimum(away, FOLLOW_M))
     again = {int(row): int(column) for row, column in zip(rows, columns, strict=True)}
     if 0 not in again or not away[0, again[0]] < FOLLOW_M:
-        raise UsageError(
+        raise PartError(
             f"{source}: the part that was at {_shown(followed.centre)} in the scan before is not found again; scan the "
             f"object anew under another name, or begin another history. {_listed(numbered)}"
         )

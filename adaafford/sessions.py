@@ -352,7 +352,7 @@ class Session:
         frame = ScanFrame.around(scan if cut is None else cut.scan, up, self._camera)
         if self._up is None and (doubt := doubtful_up(scan, frame)):
             self._tell(f"{path}: {doubt}; if so, say it by --up and begin another history")
-        self._remember(scan, cut, sha256, frame, None)
+        self._remember(scan, cut, path, sha256, frame, None)
         return History(frame=frame, part=self._choice, lens=self._lens)
 
     def _about_the_part(self, history: History) -> History:
@@ -395,7 +395,7 @@ class Session:
             if history.part is not None:
                 self._finder = self._finder or PartFinder(self._task)
                 cut = self._finder.cut_out(scan, frame.up, frame.camera, history.part, followed, str(path))
-            self._remember(scan, cut, sha256, frame, followed)
+            self._remember(scan, cut, path, sha256, frame, followed)
         return self._seen[sha256, frame, followed]
 
     def _file(self, name: str) -> tuple[Path, bytes, str]:
@@ -406,14 +406,13 @@ class Session:
 
     def _parsed(self, data: bytes, path: Path, choice: str | None, lens: Lens | None) -> Scan:
         raw = choice is not None
-        scan = parse_scan(data, path, raw=raw) if lens is None else parse_depth(data, path, lens, raw=raw)
-        if missing := missing_points(scan):
-            self._tell(f"{path}: {missing}")
-        return scan
+        return parse_scan(data, path, raw=raw) if lens is None else parse_depth(data, path, lens, raw=raw)
 
     def _remember(
-        self, scan: Scan, cut: CutOut | None, sha256: str, frame: ScanFrame, followed: FollowedPart | None
+        self, scan: Scan, cut: CutOut | None, path: Path, sha256: str, frame: ScanFrame, followed: FollowedPart | None
     ) -> None:
+        if missing := missing_points(scan):
+            self._tell(f"{path}: {missing}")
         scan = scan if cut is None else cut.scan
         observed = observation_of(scan, frame, self._seed, self._points)
         if self._arm is not None and self._primitive is not None:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,11 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from adaafford.parts import bundled_segmenter, read_segmenter
+from adaafford.histories import TriedOutcome
+from adaafford.parts import AUTO, bundled_segmenter, read_segmenter
+from adaafford.pretrained import load_policy
+from adaafford.scans import Scan, npz_of
+from adaafford.sessions import Session, SessionFiles
 from benchmarks.script import main
 from cluster.cli.commands.bench import BenchSettings
 from collector.objects.articulation import ArticulatedObject
@@ -35,6 +40,8 @@ from shared.segmentation.segmenter import Segmentation, Segmenter
 SEEN_POINTS = 150
 """A part of which fewer points are scanned is not asked for."""
 WORST = 8
+POLICIES = {"push-faucet": "push-faucet"}
+"""Bundled policies by task; that for doors for all other tasks."""
 
 
 class SegmentingSettings(BenchSettings):
@@ -46,6 +53,9 @@ class SegmentingSettings(BenchSettings):
     """The --out of `adaafford train segmentation`; default: the bundled network."""
     noise: float = Field(1.0, ge=0, le=10)
     """Strength of the errors of the camera."""
+    steps: int = Field(0, ge=0, le=1000)
+    """Time so many steps of a session with raw scans, too: the files are read, the part is found, an action is proposed
+    by a bundled policy of the task, and the affordance and the parts are written."""
     pictures: Path | None = None
     """Folder for pictures of the scenes: what was measured, what is true, and what was found."""
 
@@ -88,6 +98,8 @@ def measure(command: SegmentingSettings) -> dict[str, Any]:
                 found.append(_measured(segmenter, target, seen, picture))
             progress.show(number + 1)
     result = _table(found)
+    if command.steps:
+        result |= _timed_steps(command, load(usable[0]))
     worst = sorted(found, key=lambda one: one.auto)[:WORST]
     print("worst: " + ", ".join(f"{one.object} ({one.category}) {one.auto:.2f}" for one in worst))
     return result | {"worst": [[one.object, one.category, round(one.auto, 3)] for one in worst], "noise": command.noise}
@@ -157,6 +169,35 @@ def _table(found: list[Found]) -> dict[str, Any]:
     milliseconds = round(1000 * median(one.seconds for one in found), 1)
     print(f"{milliseconds:.0f} ms a scan (median), {torch.get_num_threads()} threads")
     return {"categories": rows, "milliseconds": milliseconds, "threads": torch.get_num_threads()}
+
+
+def _timed_steps(command: SegmentingSettings, target: ArticulatedObject) -> dict[str, Any]:
+    """Duration of a step of a session, in wall time and in processor time."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        policy = load_policy(POLICIES.get(command.task, "pull-closed-door"))
+        session = Session(policy, SessionFiles(folder / "history.json", folder / "heatmap.ply"), part=AUTO)
+        wall, processor = [], []
+        for number in range(command.steps + 1):
+            seen = random_scan(target, (command.noise, command.noise), seeds.generator(command.seed, "bench/steps", 0))
+            camera = (*map(float, seen.world_from_camera[:3, 3]),)
+            path = folder / f"scan-{number}.npz"
+            # Another scan of the same state: nothing is remembered of it.
+            places = seen.image.points.astype(np.float32).astype(np.float64) + 1e-4 * number
+            path.write_bytes(npz_of(Scan(places, camera=(camera[0], camera[1], camera[2]))))
+            begun, spent = time.perf_counter(), time.process_time()
+            session.step(path, None if number == 0 else TriedOutcome(motion=0.0), number or None)
+            wall.append(time.perf_counter() - begun)
+            processor.append(time.process_time() - spent)
+    figures = {
+        "step_milliseconds": round(1000 * median(wall[1:]), 1),
+        "step_processor_milliseconds": round(1000 * median(processor[1:]), 1),
+    }
+    print(
+        f"{figures['step_milliseconds']:.0f} ms a step (median of {command.steps}), of them "
+        f"{figures['step_processor_milliseconds']:.0f} ms of the processor; the files are read and written in it"
+    )
+    return figures
 
 
 def _draw(path: Path, seen: RawScan, found: Segmentation, title: str) -> None:

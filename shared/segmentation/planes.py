@@ -18,6 +18,8 @@ LEAST_SHARE = 0.04
 LEAST_WIDTH = 0.5
 """A wall is at least as wide as this share of the scan, floor included; fronts of objects are narrower."""
 MOST_WALLS = 2
+CONSIDERED = 20
+"""The hypotheses with the most points, of which the first that is wide enough is the wall."""
 
 
 def floor_and_walls(points: Float, camera: Float, rng: np.random.Generator) -> tuple[NDArray[np.bool_], float]:
@@ -71,15 +73,14 @@ def _plane(
     heights = sample @ normals.T - (normals * corners).sum(axis=1)
     on, behind = (np.abs(heights) <= TOLERANCE_M).mean(axis=0), (heights < -2 * TOLERANCE_M).mean(axis=0)
     on = np.where((behind <= BEHIND) & (on >= LEAST_SHARE), on, 0.0)
-    if upright:
-        # Along the wall, level.
-        along = np.stack([-normals[:, 1], normals[:, 0]])
-        across, room = sample[:, :2] @ along, scan[rng.integers(len(scan), size=SAMPLE), :2] @ along
-        widths = [_width(across[np.abs(h) <= TOLERANCE_M, n]) if on[n] > 0 else 0.0 for n, h in enumerate(heights.T)]
-        on = np.where(np.array(widths) >= LEAST_WIDTH * np.ptp(np.percentile(room, [1, 99], axis=0), axis=0), on, 0.0)
-    if not on.any():
+    best = None
+    for number in np.argsort(-on)[: CONSIDERED if upright else 1]:
+        if on[number] > 0 and (not upright or _is_wide(normals[number], heights[:, number], sample, scan, rng)):
+            best = int(number)
+            break
+    if best is None:
         return None
-    normal, corner = normals[on.argmax()], corners[on.argmax()]
+    normal, corner = normals[best], corners[best]
     for _ in range(2):
         near = points[np.abs((points - corner) @ normal) <= TOLERANCE_M]
         corner = near.mean(axis=0)
@@ -88,6 +89,17 @@ def _plane(
     return normal, float(normal @ corner)
 
 
-def _width(places: Float) -> float:
-    """How far places on a line, [any], reach, but for outliers."""
-    return float(np.ptp(np.percentile(places, [1, 99])))
+def _is_wide(normal: Float, heights: Float, sample: Float, scan: Float, rng: np.random.Generator) -> bool:
+    """Whether an upright plane is as wide as a wall.
+
+    Args:
+        normal: [3], of the plane.
+        heights: [S], of the sample's points above it.
+        sample: [S, 3].
+        scan: [M, 3].
+        rng: draws the points of the scan that say how wide it is.
+    """
+    along = np.array([-normal[1], normal[0]])
+    room = scan[rng.integers(len(scan), size=SAMPLE), :2] @ along
+    width = np.ptp(np.percentile(sample[np.abs(heights) <= TOLERANCE_M, :2] @ along, [1, 99]))
+    return bool(width >= LEAST_WIDTH * np.ptp(np.percentile(room, [1, 99])))

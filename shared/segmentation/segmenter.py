@@ -6,6 +6,7 @@ Shapes: M points of a scan, N points that the network is given.
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -31,10 +32,14 @@ from shared.types import Float, Float32
 
 SEGMENTATION_FILE = "segmentation.json"
 MAX_DOCUMENT_BYTES = 1 << 16
-PEAK_M, APART_M = 0.06, 0.16
-"""Votes within the first are counted together; middles of two parts are at least as far apart as the second."""
-LEAST_VOTES = 12
+PEAK_M, APART_M = 0.12, 0.3
+"""Votes within the first are counted together; those within the second of a maximum are for the same middle."""
+JOINED = 0.35
+"""Clusters whose middles are nearer than this share of the extent of both together are one part."""
+LEAST_VOTES = 15
 """The fewest points of the network's input that make a part."""
+FEW_POINTS = 60
+"""A part of so many points of the network's input is half as confident as a large one."""
 TOUCHING_M = 0.12
 """Points of the network's input that are nearer to each other belong to one thing."""
 ABSORBED = 0.05
@@ -59,13 +64,11 @@ class Part:
     Attributes:
         kind: how it moves.
         points: [any], the points of the scan that are of it.
-        centre: [3], the middle of these points, frame of the scan.
-        confidence: mean probability of its kind over its points, in [0, 1].
+        confidence: mean probability of its kind over its points, less for a part of few points; in [0, 1].
     """
 
     kind: Kind
     points: NDArray[np.int64]
-    centre: Float
     confidence: float
 
 
@@ -113,11 +116,11 @@ class Segmenter:
         parts = []
         for label in range(1, labels.max() + 1):
             mine = labels == label
-            kind = Kind(int(kinds[mine][0]))
             rows = given.left[spread == label]
-            if len(rows):
-                centre = (points[rows].min(axis=0) + points[rows].max(axis=0)) / 2
-                parts.append(Part(kind, rows, centre, float(probabilities[mine, kind].mean())))
+            if mine.any() and len(rows):
+                kind = max(MOVABLE, key=lambda kind: float(probabilities[mine, kind].sum()))
+                share = mine.sum() / (mine.sum() + FEW_POINTS)
+                parts.append(Part(kind, rows, float(share * probabilities[mine, kind].mean())))
         parts.sort(key=lambda part: -part.confidence)
         return Segmentation(given.left[spread >= 0], tuple(parts))
 
@@ -169,12 +172,8 @@ def part_labels(points: Float32, kinds: NDArray[np.int64], votes: Float32) -> ND
     labels = np.full(len(points), -1)
     of_object = np.flatnonzero(kinds != Kind.BACKGROUND)
     labels[of_object[_one_thing(points[of_object])]] = 0
-    found = 0
-    for kind in MOVABLE:
-        mine = np.flatnonzero((kinds == kind) & (labels == 0))
-        clusters = _clusters(votes[mine])
-        labels[mine[clusters >= 0]] = clusters[clusters >= 0] + 1 + found
-        found += clusters.max(initial=-1) + 1
+    mine = np.flatnonzero(np.isin(kinds, MOVABLE) & (labels == 0))
+    labels[mine] = _clusters(points[mine], votes[mine]) + 1
     return labels
 
 
@@ -189,8 +188,8 @@ def _one_thing(points: Float32) -> NDArray[np.bool_]:
     return kept
 
 
-def _clusters(votes: Float32) -> NDArray[np.int64]:
-    """Numbers of the parts that votes are for, from 0, [any]; -1 for votes for what hardly any other votes for."""
+def _clusters(points: Float32, votes: Float32) -> NDArray[np.int64]:
+    """Numbers of the parts that points vote for, from 0, [any]; -1 for votes for what hardly any other votes for."""
     numbers = np.full(len(votes), -1)
     if len(votes) < LEAST_VOTES:
         return numbers
@@ -201,8 +200,7 @@ def _clusters(votes: Float32) -> NDArray[np.int64]:
         peak = int(np.where(left, support, -1).argmax())
         if support[peak] < LEAST_VOTES:
             break
-        near = tree.query_ball_point(votes[peak], PEAK_M)
-        middle = votes[near].mean(axis=0)
+        middle = votes[tree.query_ball_point(votes[peak], PEAK_M)].mean(axis=0)
         around = np.linalg.norm(votes - middle, axis=1) < APART_M
         if (around & left).sum() >= LEAST_VOTES:
             peaks.append(middle)
@@ -210,7 +208,29 @@ def _clusters(votes: Float32) -> NDArray[np.int64]:
         left[peak] = False
     if not peaks:
         return numbers
-    return np.asarray(cKDTree(np.array(peaks)).query(votes)[1], dtype=np.int64)
+    numbers = np.asarray(cKDTree(np.array(peaks)).query(votes)[1], dtype=np.int64)
+    return _merged(points, votes, numbers)
+
+
+def _merged(points: Float32, votes: Float32, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Clusters after those were joined that vote for one middle, for the size of what they are together.
+
+    The middles of two doors beside each other are half as far apart as both are wide; votes for one door are nearer.
+    """
+    while True:
+        found = np.unique(numbers)
+        middles = np.array([np.median(votes[numbers == number], axis=0) for number in found])
+        best, pair = JOINED, None
+        for one, other in combinations(range(len(found)), 2):
+            apart = middles[other] - middles[one]
+            length = max(float(np.linalg.norm(apart)), 1e-6)
+            along = points[np.isin(numbers, found[[one, other]])] @ (apart / length)
+            ratio = length / max(float(np.ptp(np.percentile(along, [5, 95]))), 1e-6)
+            if ratio < best:
+                best, pair = ratio, (one, other)
+        if pair is None:
+            return np.searchsorted(found, numbers)
+        numbers = np.where(numbers == found[pair[1]], found[pair[0]], numbers)
 
 
 def _spread(points: Float, known: Float, labels: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -498,7 +498,7 @@ def test_what_looks_wrong_in_a_scan_is_said_once_and_changes_nothing(
     where = ["--cloud", str(scan), "--history", str(scan.parent / "history.json"), "--policy", str(policy_folder)]
     assert adaafford(["adapt", *where]) == 0
     first = capsys.readouterr()
-    missing, up = first.err.splitlines()
+    up, missing = first.err.splitlines()
     assert "up is probably 0 -1 0" in up
     assert "1500 of 3000 points were not measured" in missing
     assert read_history(scan.parent / "history.json").frame.up == (0.0, 0.0, 1.0)

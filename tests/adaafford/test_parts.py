@@ -8,7 +8,7 @@ import pytest
 
 from adaafford import parts
 from adaafford.histories import TriedOutcome, read_history
-from adaafford.parts import PartChoice, PartFinder, read_segmenter
+from adaafford.parts import PartChoice, PartError, PartFinder, read_segmenter
 from adaafford.scans import Scan, checked_scan
 from adaafford.sessions import Session, SessionFiles, parts_file
 from cluster.cli.main import run as adaafford
@@ -42,8 +42,8 @@ class GivenSegmenter(Segmenter):
         for side, confidence in ((1.0, 0.9), (-1.0, 0.7)):
             mine = np.flatnonzero(thing & (points[:, 0] < 1.0) & (side * points[:, 1] > 0))
             if len(mine):
-                found.append(Part(Kind.TURNING, mine, points[mine].mean(axis=0), confidence))
-        found.append(Part(Kind.SLIDING, np.flatnonzero(thing)[:100], np.zeros(3), 0.5))
+                found.append(Part(Kind.TURNING, mine, confidence))
+        found.append(Part(Kind.SLIDING, np.flatnonzero(thing)[:100], 0.5))
         return Segmentation(np.flatnonzero(thing), tuple(found))
 
 
@@ -102,7 +102,8 @@ def test_the_part_is_followed_where_it_moved_to(tmp_path: Path) -> None:
     once = begun_session.step(first)
     assert begun_session.step(first).model_copy(update={"seconds": once.seconds}) == once
     assert session(tmp_path, None).step(first).model_copy(update={"seconds": once.seconds}) == once, "without --part"
-    second = write(tmp_path / "scan-2.npz", room(right=0.7))
+    stray = np.tile([[-1.0, -0.1, 0.4]], (5, 1))
+    second = write(tmp_path / "scan-2.npz", np.concatenate([room(right=0.7), stray]))
     later = session(tmp_path, "2").step(second, TOLD, 1)
     assert later.tries == 1 and later.part is not None
     assert later.part.chosen.centre[0] == pytest.approx(0.71, abs=0.02)
@@ -130,7 +131,7 @@ def test_what_cannot_be_found_is_said_in_one_line(tmp_path: Path) -> None:
         assert not (tmp_path / "history.json").exists()
     session(tmp_path, "2").step(scan)
     gone = room()
-    with pytest.raises(UsageError, match="is not found again"):
+    with pytest.raises(PartError, match="is not found again"):
         session(tmp_path, None).step(write(tmp_path / "scan-3.npz", room(right=1.5)), TOLD, 1)
     with pytest.raises(UsageError, match="no turning part"):
         session(tmp_path, None).step(write(tmp_path / "scan-4.npz", gone[gone[:, 0] > 1.0]), TOLD, 1)

@@ -14,6 +14,7 @@ from shared.config import MAX_NOISE, PANDA
 from shared.errors import UsageError
 from shared.extras import require
 from shared.io.files import make_folder
+from shared.io.text import plain
 
 if TYPE_CHECKING:
     from adaafford.sessions import Request, Step
@@ -147,7 +148,7 @@ def _follow(robot: "SimulatedRobot") -> int:
 
 def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy") -> bool:
     """A whole session with one robot; whether it succeeded."""
-    from adaafford.parts import AUTO
+    from adaafford.parts import AUTO, PartError
     from adaafford.sessions import Session, SessionFiles
     from cluster.evaluation.rehearsal import Goal, rehearse
     from shared.arms.arm import arm_of
@@ -174,7 +175,11 @@ def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy")
         )
 
     goal = None if command.goal is None else Goal(command.goal, command.within, command.repeat)
-    return rehearse(robot, session, tell, goal)
+    try:
+        return rehearse(robot, session, tell, goal)
+    except PartError as error:
+        print(plain(f"{folder.name} given up: {error}"), flush=True)
+        return False
 
 
 def _summary(command: RehearseCommand, ended: list[bool]) -> str:
