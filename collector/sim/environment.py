@@ -155,9 +155,7 @@ def only_sapien(environment: SimEnvironment) -> SapienEnvironment:
         UsageError: it is of another simulator.
     """
     if not isinstance(environment, SapienEnvironment):
-        raise UsageError(
-            "this measures SAPIEN's physics alone; leave collection.simulator at 'sapien', without an arm"
-        )
+        raise UsageError("this measures SAPIEN's physics alone; leave collection.simulator at 'sapien', without an arm")
     return environment
 
 
