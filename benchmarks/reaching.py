@@ -1,4 +1,4 @@
-"""What does an arm cost? The share of random actions that it cannot reach, and the time of a check and of a step.
+"""What does an arm cost? The share of random actions out of reach, and the processor time of a check and of a step.
 
 The objects, their states and the bases of the arm are those of `adaafford collect` with the same seed. Every trajectory
 of a proposal is checked again by a fresh `ArmReach`, by forward kinematics and against the joint limits.
@@ -87,9 +87,9 @@ def measure(command: ReachSettings) -> dict[str, Any]:
                     wrong += path is not None and not _executes(plan.setting.arm, reach, action, path)
                     free = make(adapter, rng).propose(replace(seen, reach=None), []) if k == 0 else None
                     without_reach += free is not None and reach.trajectory(free) is None
-            begun = time.perf_counter()
+            begun = time.process_time()
             reachable_points(replace(seen, reach=_fresh(plan.setting.arm, environment)))
-            times["marks"].append(time.perf_counter() - begun)
+            times["marks"].append(time.process_time() - begun)
     low, high = wilson(random - reached, random)
     share, known = 1 - reached / random, 2 * len(times["marks"])
     print(f"{random} random actions: {100 * share:.0f}% [{100 * low:.0f}, {100 * high:.0f}] out of reach")
@@ -126,13 +126,13 @@ def _fresh(arm: Arm, environment: ArmedEnvironment) -> ArmReach:
 def _step(
     seen: Observation, reach: Callable[[], ArmReach] | None, proposer: Proposer, adapter: Adapter
 ) -> tuple[float, Action]:
-    """Seconds of a step on an observation that is new to the networks and to the arm, and its action."""
-    begun = time.perf_counter()
+    """Processor time, s, of a step on an observation that is new to the networks and to the arm, and its action."""
+    begun = time.process_time()
     new = replace(seen, reach=None if reach is None else reach())
     action = proposer.propose(new, [])
     adapter.affordance(new, [])
     assert action is not None
-    return time.perf_counter() - begun, action
+    return time.process_time() - begun, action
 
 
 def _executes(arm: Arm, reach: ArmReach, action: Action, path: Float) -> bool:

@@ -34,23 +34,23 @@ def require(purpose: str, *extras: str, without: tuple[str, ...] = ()) -> None:
         UsageError: one is not installed.
     """
     for extra in extras:
-        require_packages(purpose, *(name for name in EXTRAS[extra] if name not in without))
+        require_packages(purpose, *(name for name in EXTRAS[extra] if name not in without), extra=extra)
 
 
-def require_packages(purpose: str, *packages: str) -> None:
-    """Check that packages are installed.
+def require_packages(purpose: str, *packages: str, extra: str | None = None) -> None:
+    """Check that packages are installed; `extra` brings them, or the first that brings each.
 
     Raises:
         UsageError: one is not.
     """
     missing = [name for name in packages if find_spec(MODULES.get(name, name)) is None]
     if missing:
-        raise UsageError(missing_line(purpose, *missing))
+        raise UsageError(missing_line(purpose, *missing, extra=extra))
 
 
-def missing_line(purpose: str, *packages: str) -> str:
-    """The message if packages are not installed."""
-    extras = sorted({extra_of(name) for name in packages} - {None}, key=str)
+def missing_line(purpose: str, *packages: str, extra: str | None = None) -> str:
+    """The message if packages are not installed; `extra` as above."""
+    extras = [extra] if extra else sorted({extra_of(name) for name in packages} - {None}, key=str)
     names = " and ".join(filter(None, [", ".join(packages[:-1]), packages[-1]]))
     how = f"pip install 'adaafford[{','.join(map(str, extras))}]'" if extras else f"pip install {' '.join(packages)}"
     return f"{purpose} needs {names}, not installed here: {how}"

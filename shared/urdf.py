@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element, ParseError
 import numpy as np
 
 from shared.errors import ObjectError
-from shared.extras import require_packages
+from shared.extras import require
 from shared.io.text import short
 from shared.types import Float
 
@@ -171,7 +171,7 @@ def parse_xml(data: bytes, most_bytes: int) -> Element:
     """
     if len(data) > most_bytes:
         raise ObjectError(f"{len(data)} bytes; at most {most_bytes} are allowed")
-    require_packages("a URDF", "defusedxml")
+    require("a URDF", "arm")
     import defusedxml
     import defusedxml.ElementTree
 

@@ -123,4 +123,4 @@ def _rotation(approach: Float, forward: Float) -> Float:
     return gripper_rotation(approach / lengths[0], forward / lengths[1])
 
 
-_FIELDS = tuple(each.name for each in fields(Observation) if each.name != "dense")
+_FIELDS = tuple(each.name for each in fields(Observation) if each.name not in ("dense", "reach"))

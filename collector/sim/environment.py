@@ -163,7 +163,7 @@ def only_sapien(environment: SimEnvironment) -> SapienEnvironment:
         UsageError: it is of another simulator.
     """
     if not isinstance(environment, SapienEnvironment):
-        raise UsageError("this measures SAPIEN's physics; leave collection.simulator at 'sapien'")
+        raise UsageError("this measures SAPIEN's physics alone; leave collection.simulator at 'sapien', without an arm")
     return environment
 
 

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from shared.arms.reach import reachable_points
 from shared.errors import UsageError
 from shared.geometry import gripper_rotation, points_in_view, view_from_world
 from shared.networks.aap import Aap
@@ -330,7 +331,7 @@ def frames_in_view(observation: Observation, actions: Sequence[Action]) -> Tenso
     return torch.from_numpy(np.array(rows, dtype=np.float32).reshape(-1, 6))
 
 
-MOST_POINTS, NEAR_M = 16, 0.05
+MOST_POINTS, NEAR_M = 8, 0.05
 """Points at which an action within the arm's reach is looked for, and how far apart they are, m."""
 
 
@@ -342,6 +343,8 @@ def reachable_action(
 ) -> Action:
     """The best action at a point; where the arm is known, the best that it reaches, at the next point if need be.
 
+    Once nothing is reached at the first point, points come first that `reachable_points` finds in reach.
+
     Args:
         observation: with or without an arm.
         points: indices of the points that may be chosen, [C].
@@ -352,9 +355,9 @@ def reachable_action(
         If the arm reaches none: the best action at the first point, whose trajectory is then None.
     """
     places: Float = observation.points[points].astype(np.float64)
-    left, best = np.arange(len(points)), None
+    left, likely, best = np.ones(len(points), np.bool_), np.ones(len(points), np.bool_), None
     for _ in range(MOST_POINTS):
-        chosen = choose(left)
+        chosen = choose(np.flatnonzero(left & likely if (left & likely).any() else left))
         point = int(points[chosen])
         proposals, scores = act(point)
         if best is None:
@@ -365,8 +368,9 @@ def reachable_action(
             action = action_from_frame(observation, point, proposals.frames[place])
             if observation.reach.trajectory(action) is not None:
                 return action
-        left = left[np.linalg.norm(places[left] - places[chosen], axis=1) > NEAR_M]
-        if not len(left):
+        likely = reachable_points(observation)[points]
+        left &= np.linalg.norm(places - places[chosen], axis=1) > NEAR_M
+        if not left.any():
             break
     assert best is not None, "there is a first point"
     return best

@@ -66,6 +66,8 @@ def check_quarantined(rollouts: Sequence[RolloutRecord], quarantined: Sequence[Q
 
 
 def _check_rollout(rollout: RolloutRecord, points: int) -> None:
+    if len(rollout.arm_base) not in (0, 4):
+        raise ValueError(f"needs an arm_base of 4 numbers or none; given {len(rollout.arm_base)}")
     _check_texts(rollout.fidelity, rollout.status, rollout.object.category)
     if missing := ALWAYS_DRAWN.keys() - rollout.dynamics.values.keys():
         raise ValueError(f"lacks the hidden parameter '{min(missing)}'")

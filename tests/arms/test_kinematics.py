@@ -163,6 +163,15 @@ def test_a_file_that_cannot_be_used_is_refused_in_one_line(change, said: str, tm
     assert str(file) in str(refused.value) and "\n" not in str(refused.value)
 
 
+def test_without_its_extra_only_built_in_arms_are_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "arm.urdf"
+    file.write_text(urdf_of(BENT))
+    monkeypatch.setattr("shared.extras.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"a URDF needs defusedxml.*pip install 'adaafford\[arm\]'"):
+        arm_of(str(file))
+    assert arm_of("panda") == ARMS.get("panda")
+
+
 def test_an_unknown_arm_is_refused_with_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="allowed: panda, ur5e"):
         arm_of("pumas")

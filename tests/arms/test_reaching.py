@@ -28,7 +28,7 @@ from shared.arms.arm import ARMS, URDF
 from shared.arms.kinematics import chain_of
 from shared.arms.reach import ArmReach, reachable_points
 from shared.config import CameraConfig, CollectionConfig, Fidelity, RolloutConfig
-from shared.errors import UsageError
+from shared.errors import StoreError, UsageError
 from shared.geometry import camera_pose, gripper_rotation
 from shared.plan import Job, Plan, Setting
 from shared.policies.adaptation import Adapter
@@ -39,6 +39,7 @@ from shared.store.codecs.columns import ROLLOUT_COLUMNS, RolloutRow
 from shared.store.codecs.digest import rollout_digest
 from shared.store.codecs.tables import read_table, table_bytes
 from shared.store.layout import ARM_VERSION
+from shared.store.validity import check_rollouts
 from shared.tasks import task_named
 from shared.types import Action, HiddenDynamics, Observation, OutcomeKind
 from tests.adaafford.test_adapt_command import front
@@ -183,12 +184,15 @@ def test_an_arm_is_part_of_a_setting_only_if_there_is_one(tmp_path: Path) -> Non
         make_setting(task, CollectionConfig(arm="puma"), seed=1, objects=refs)
 
 
-def test_the_base_is_stored_beside_the_content_of_a_rollout() -> None:
+def test_the_base_is_part_of_a_rollout_that_has_one() -> None:
     plain = fabricate_rollout(Plan(setting=fabricate_setting()), 0)
     armed = dataclasses.replace(plain, arm_base=(1.0, 2.0, 3.0, 4.0))
-    assert rollout_digest(plain) == rollout_digest(armed)
+    assert rollout_digest(plain) != rollout_digest(armed)
     data = table_bytes(ROLLOUT_COLUMNS, [RolloutRow(plain, 0), RolloutRow(armed, 0)])
     assert read_table(data, ROLLOUT_COLUMNS, 2, "x").column("arm_base").to_pylist() == [[], [1.0, 2.0, 3.0, 4.0]]
+    with pytest.raises(StoreError, match="arm_base of 4 numbers"):
+        bad = dataclasses.replace(plain, arm_base=(1.0,))
+        check_rollouts([bad], Job(plain.plan_key, 0, 1), len(plain.observations[0].points), "x")
     older = [column for column in ROLLOUT_COLUMNS if column.name != "arm_base"]
     data = table_bytes(older, [RolloutRow(plain, 0)])
     assert read_table(data, ROLLOUT_COLUMNS, 1, "x").column("arm_base").to_pylist() == [[]]

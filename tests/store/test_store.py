@@ -159,6 +159,7 @@ def mutations(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 def test_the_digest_changes_with_every_value_but_the_time() -> None:
     rollout = fabricate_rollout(PLAN, 0, interactions=3, per_observation=1)
+    rollout = dataclasses.replace(rollout, arm_base=(1.0, 2.0, 3.0, 4.0))
     digest = rollout_digest(rollout)
     changed = {name: rollout_digest(other) != digest for name, other in mutations(rollout)}
     assert len(changed) > 45

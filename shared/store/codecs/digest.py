@@ -30,6 +30,9 @@ def rollout_digest(rollout: RolloutRecord, clouds: Sequence[Packed] | None = Non
         # Earlier software did not tell the two apart; the same plan shall have the digest that it had.
         rollout = replace(rollout, status=RolloutStatus.NOTHING_TO_ACT_ON)
     _add_columns(digest, rollout_columns(rollout.dynamics.added), [RolloutRow(rollout, 0)])
+    if rollout.arm_base:
+        # Not every store has it, and those without keep their digests.
+        _add(digest, "arm_base", [len(rollout.arm_base)], np.array(rollout.arm_base, "<f8").tobytes())
     rows = [InteractionRow(rollout, interaction, 0) for interaction in rollout.interactions]
     _add_columns(digest, INTERACTION_COLUMNS, rows)
     for cloud in map(pack, rollout.observations) if clouds is None else clouds:
