@@ -10,6 +10,7 @@ import pytest
 from collector.objects.catalogue import for_task, scan
 from collector.objects.procedural import generate
 from collector.worker import Worker
+from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.plan import Job, Plan, Setting
 from shared.store import Store
 from shared.tasks import task_named
@@ -103,6 +104,21 @@ def test_the_number_of_workers_does_not_matter(
     fresh: Store, objects: Path, tmp_path: Path, workers: int, per_shard: int
 ) -> None:
     assert collected(tmp_path / "store", objects, workers, per_shard).digest() == fresh.digest()
+
+
+def test_the_order_of_jobs_does_not_matter_to_a_suction_cup_or_to_the_errors_of_a_camera(
+    objects: Path, tmp_path: Path
+) -> None:
+    refs = tuple(entry.ref for entry in for_task(scan(objects), task_named("pull")).usable)
+    collection = CollectionConfig(
+        gripper="suction",
+        camera=CameraConfig(image_size=128, points=256, candidates=1000, noise=1.0),
+        rollout=RolloutConfig(interactions=4, actions_per_state=2),
+    )
+    setting = Setting(task="pull", seed=11, objects=refs, collection=collection)
+    jobs = {"one": [(0, 3)], "more": [(2, 3), (0, 1), (1, 2)]}
+    digests = {digest_of(tmp_path / name, setting, objects, of) for name, of in jobs.items()}
+    assert len(digests) == 1
 
 
 @pytest.mark.slow
