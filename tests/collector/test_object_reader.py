@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from collector.objects import meshes, urdf
+from collector.objects import meshes
 from collector.objects.files import ObjectFiles
 from collector.objects.readers import read_object
+from shared import urdf
 from shared.errors import ObjectError
 
 CUBE_OBJ = (

@@ -70,9 +70,7 @@ def test_compiled_code_is_kept_in_the_cache_of_the_user_and_nowhere_without_a_ho
     here, cache, temporary = tmp_path / "here", tmp_path / "cache", Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))
     here.mkdir()
     script = tmp_path / "small.py"
-    script.write_text(
-        "from shared.policies.furthest_points import _compiled\n@_compiled()\ndef f(x):\n    return x + 1\nf(1)\n"
-    )
+    script.write_text("from shared.compilation import compiled\n@compiled()\ndef f(x):\n    return x + 1\nf(1)\n")
     base = {name: value for name, value in os.environ.items() if name not in ("HOME", "XDG_CACHE_HOME")}
     base |= {"PYTHONPATH": str(Path(__file__).parents[2]), "TMPDIR": str(temporary)}
     for more in ({"XDG_CACHE_HOME": str(cache)}, {"HOME": "~"}):

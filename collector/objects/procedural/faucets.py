@@ -53,13 +53,13 @@ def _side_faucet(rng: np.random.Generator) -> ObjectModel:
     )
     style = rng.choice(["lever", "lever", "cross"])
     length, upper = float(rng.uniform(0.18, 0.35)), float(rng.uniform(0.4, 1.0) * np.pi)
-    tilt = float(rng.uniform(-0.4, 0.4))
     switches = []
     for side in (1.0, -1.0) if rng.random() < 0.4 else (1.0 if rng.random() < 0.5 else -1.0,):
         stand = (0.0, side * (radius + arm), middle)
         body += (rod((0.0, side * 0.8 * radius, middle), stand, 0.55 * radius),)
         hub = rod((0.0, side * 0.005, 0.0), (0.0, side * 0.1, 0.0), 0.6 * radius)
-        angles = [tilt] if style == "lever" else list(np.pi * (np.arange(4) / 2 + 0.25))
+        # A lever that leans would fall one way only, and so show which way it turns.
+        angles = [0.0] if style == "lever" else list(np.pi * (np.arange(4) / 2 + 0.25))
         reach = length if style == "lever" else 0.5 * length
         start = (0.0, side * 0.07, 0.0)
         arms = tuple(
