@@ -61,9 +61,9 @@ def test_the_policies_that_come_along_say_what_they_have_seen(tmp_path: Path) ->
     for seed, folder in made.items():
         generate(folder, {"Faucet": 5}, seed)
     contents = {seed: {entry.ref.content_hash for entry in scan(folder).usable} for seed, folder in made.items()}
-    # They were trained on, or judged by, 240 of the 300 faucets of seed 1.
+    # They were trained on, or judged by, 240 of 300 faucets of seed 1, and 192 of 240 of seed 31.
     seen = seen_by("push-faucet")
-    assert len(seen) == 240
+    assert len(seen) == 240 + 192
     assert seen & contents[1]
     assert not seen & contents[2]
     assert seen_by("pull-closed-door")
