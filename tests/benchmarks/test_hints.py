@@ -13,8 +13,12 @@ from hypothesis.extra.numpy import arrays
 
 from benchmarks.hinting import HintSettings, distance_from_axis, hints_of, measure
 from benchmarks.script import run_script
+from collector.objects.procedural.assembly import normalised
+from collector.objects.procedural.cabinets import random_storage_furniture
+from collector.objects.writing import write_object
 from shared.plan import Job, Plan
 from shared.records import InteractionRecord, RolloutRecord
+from shared.seeds import generator
 from shared.types import Float32, Interaction, Observation, Outcome, OutcomeKind
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting
 from tests.support.small_trainings import make_store
@@ -124,10 +128,16 @@ def test_a_policy_of_another_task_is_refused_before_anything_is_tried(
 def test_the_policy_that_comes_along_takes_a_success_on_the_free_side_for_what_it_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert hints("--rollouts", "60", "--json", "--picture", str(tmp_path / "hints.png")) == 0
+    # On fitted cabinets a free edge may meet another leaf, so that a success there says less about the hinge.
+    cabinets = tmp_path / "cabinets"
+    for index in range(40):
+        made = random_storage_furniture(generator(1_000, "procedural StorageFurniture", index))
+        write_object(cabinets / f"{index:02d}", normalised(made))
+    flags = "--objects", str(cabinets), "--json", "--picture", str(tmp_path / "hints.png")
+    assert hints(*flags) == 0
     success = json.loads(capsys.readouterr().out.splitlines()[-1])["cases"]["success-free"]
     assert success["tries"] >= 15
     assert success["free"]["brighter"] > 0.9
-    assert success["hinge"]["brighter"] < 0.25
-    assert success["hinge"]["after"] < 0.8 * success["hinge"]["before"]
+    assert success["hinge"]["brighter"] < 0.4
+    assert success["hinge"]["after"] < 0.95 * success["hinge"]["before"]
     assert (tmp_path / "hints.png").read_bytes().startswith(b"\x89PNG")

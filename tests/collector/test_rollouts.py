@@ -120,7 +120,7 @@ def test_an_object_that_changed_since_is_refused(objects: Path, tmp_path: Path) 
 def test_a_rollout_is_about_one_part_and_rollouts_about_all(objects: Path) -> None:
     plan = plan_for(objects)
     touched: dict[str, set[int]] = {}
-    for index in range(8):
+    for index in range(16):
         record = rollout(plan, objects, index)
         parts = {row.target_part for row in record.interactions}
         assert len(parts) == 1
@@ -174,7 +174,8 @@ def test_a_row_is_enough_to_replay_its_interaction(objects: Path) -> None:
             again = Trial(scene, row.action, row.target_part, primitive, plan.setting.collection.fidelity).run()
             assert again.kind is row.outcome.kind
             assert again.success is row.outcome.success
-            assert again.end_joint_position == pytest.approx(row.outcome.end_joint_position, abs=5e-3)
+            # Half a percent, since a part that swings on for a radian multiplies what the scene has left of before.
+            assert again.end_joint_position == pytest.approx(row.outcome.end_joint_position, abs=5e-3, rel=5e-3)
 
 
 def test_points_and_normals_of_rows_are_those_of_their_clouds(objects: Path) -> None:

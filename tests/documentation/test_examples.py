@@ -66,9 +66,11 @@ def test_a_store_is_looked_at_and_trained_from_by_a_network_of_ones_own(place: P
 
 @pytest.mark.slow
 def test_a_program_carries_lines_between_a_session_and_a_robot_and_can_be_run_again(place: Path) -> None:
-    interactions = example(place, "robot.py", "robot").splitlines()
-    assert [line[:14] for line in interactions] == ["interaction 1:", "interaction 2:", "the action tha"]
-    assert example(place, "robot.py", "robot").splitlines() == interactions[2:]
+    *interactions, action = example(place, "robot.py", "robot").splitlines()
+    assert 1 <= len(interactions) <= 2, "AIP may stop before its budget"
+    assert all(line.startswith(f"interaction {k}: ") for k, line in enumerate(interactions, 1))
+    assert action.startswith("the action that should succeed")
+    assert example(place, "robot.py", "robot").splitlines() == [action]
 
 
 @pytest.mark.slow
