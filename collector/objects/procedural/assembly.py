@@ -1,5 +1,7 @@
 """An object under construction: a static body and the parts that hang on it, all in one frame, all closed."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point, bounding_box, mapped, point
@@ -39,6 +41,16 @@ def hinged(
 def sliding(name: str, pieces: Pieces, direction: Point, upper: float) -> MovablePart:
     """A part that slides along `direction`."""
     return MovablePart(name, "prismatic", pieces, (0.0, 0.0, 0.0), direction, upper)
+
+
+def either(
+    rng: np.random.Generator,
+    first: Callable[[np.random.Generator], ObjectModel],
+    second: Callable[[np.random.Generator], ObjectModel],
+) -> ObjectModel:
+    """An object of one of two kinds, equally often; what is drawn for the first does not depend on the second."""
+    (aside,) = rng.spawn(1)
+    return second(aside) if aside.random() < 0.5 else first(rng)
 
 
 def normalised(assembly: ObjectModel) -> ObjectModel:

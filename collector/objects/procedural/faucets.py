@@ -5,14 +5,13 @@ from itertools import pairwise
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
+from collector.objects.procedural.assembly import either
 from collector.objects.procedural.shapes import BOTTOM, LEFT, RIGHT, TOP, block, moved, rod
 
 
 def random_faucet(rng: np.random.Generator) -> ObjectModel:
     """A faucet whose switches turn about the vertical, or one whose switches are at its sides, equally often."""
-    # The draws of the first do not depend on those of the others.
-    (aside,) = rng.spawn(1)
-    return _side_faucet(aside) if aside.random() < 0.5 else _upright_faucet(rng)
+    return either(rng, _upright_faucet, _side_faucet)
 
 
 def _upright_faucet(rng: np.random.Generator) -> ObjectModel:

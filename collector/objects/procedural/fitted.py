@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
-from collector.objects.procedural.assembly import hinged
+from collector.objects.procedural.assembly import either, hinged
 from collector.objects.procedural.cabinets import Carcass, FrontPanel, random_storage_furniture
 from collector.objects.procedural.shapes import (
     BACK,
@@ -69,9 +69,7 @@ class _Leaf:
 
 def random_cabinet(rng: np.random.Generator) -> ObjectModel:
     """A free-standing cabinet or a fitted one, equally often."""
-    # The draws of the free-standing ones do not depend on those of the fitted ones.
-    (aside,) = rng.spawn(1)
-    return random_fitted_cabinet(aside) if aside.random() < 0.5 else random_storage_furniture(rng)
+    return either(rng, random_storage_furniture, random_fitted_cabinet)
 
 
 def random_fitted_cabinet(rng: np.random.Generator) -> ObjectModel:
