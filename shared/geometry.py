@@ -30,6 +30,12 @@ def camera_pose(azimuth_deg: float, elevation_deg: float, distance: float) -> Fl
     return pose
 
 
+def rotation_about_z(angle: float) -> Float:
+    """The rotation [3, 3] by an angle, rad, about z."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
 def view_from_world(world_from_camera: Float) -> Float:
     """The rotation [3, 3] into the view frame of a camera.
 

@@ -113,6 +113,15 @@ class ArticulatedObject:
             poses[k] = poses[body.joint.parent] @ body.joint.parent_from_body @ joint_motion(body.joint, position)
         return poses
 
+    def visible_boxes(self, joint_positions: Float) -> Float:
+        """The lowest and the highest corner of each body, [bodies, 2, 3], world; NaN where nothing of it is visible."""
+        boxes = np.full((len(self.bodies), 2, 3), np.nan)
+        for box, body, pose in zip(boxes, self.bodies, self.body_poses(joint_positions), strict=True):
+            if body.visuals:
+                points = np.concatenate([mesh.vertices for mesh in body.visuals]) @ pose[:3, :3].T + pose[:3, 3]
+                box[:] = points.min(axis=0), points.max(axis=0)
+        return boxes
+
 
 def joint_motion(joint: Joint, position: float) -> Float:
     """[4, 4], where a joint at `position` takes the body from where position 0 has it."""

@@ -17,6 +17,7 @@ import numpy as np
 
 from collector.objects.articulation import Mesh
 from collector.sim.engine import Assembly, Link, physx, pose, sapien
+from shared.geometry import rotation_about_z
 from shared.types import Float
 
 TIP_DISTANCE = 0.1124
@@ -237,7 +238,7 @@ class FreeGripper:
 
     def shift(self, place: Float, velocity: Float) -> None:
         """See `Gripper.shift`."""
-        turned = self._rotation @ _turn(place[3])
+        turned = self._rotation @ rotation_about_z(place[3])
         self._articulation.set_root_pose(pose(frame(turned, self._origin + self._rotation @ place[:3])))
         self._articulation.set_root_linear_velocity(self._rotation @ velocity[:3])
         self._articulation.set_root_angular_velocity(self._rotation[:, 2] * velocity[3])
@@ -276,12 +277,6 @@ class FreeGripper:
         """See `Gripper.coordinates`: palm position, its quaternion, the fingers."""
         at = self._articulation.get_root_pose()
         return np.concatenate([at.p, at.q, self._articulation.get_qpos()])
-
-
-def _turn(angle: float) -> Float:
-    """The rotation [3, 3] about up."""
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 def build_free(shape: HandShape, scene: sapien.Scene, material: physx.PhysxMaterial) -> FreeGripper:

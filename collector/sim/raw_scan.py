@@ -23,7 +23,7 @@ class RawScan:
     Attributes:
         image: with errors, world frame.
         kinds: [H], the `Kind` of each pixel.
-        centres: [bodies, 3], the middle of the box that holds each body, world.
+        centres: [bodies, 3], the middle of the box that holds each body, world; 0 0 0 where nothing of it is visible.
         world_from_camera: [4, 4].
     """
 
@@ -58,7 +58,8 @@ def raw_scan(
     kind_of[SURROUNDINGS] = Kind.BACKGROUND
     for number, part in enumerate(target.summaries(), start=1):
         kind_of[number] = Kind.TURNING if part.kind == "revolute" else Kind.SLIDING
-    return RawScan(image, kind_of[image.bodies], _centres(target, state), world_from_camera)
+    boxes = target.visible_boxes(state)
+    return RawScan(image, kind_of[image.bodies], np.nan_to_num(boxes.mean(axis=1)), world_from_camera)
 
 
 def random_scan(target: ArticulatedObject, noise: tuple[float, float], rng: np.random.Generator) -> RawScan:
@@ -75,12 +76,3 @@ def random_scan(target: ArticulatedObject, noise: tuple[float, float], rng: np.r
     pose = camera_pose(azimuth, elevation, config.distance)
     surroundings = draw_surroundings(*extent(target, state[None]), pose[:3, 3], rng)
     return raw_scan(target, state, pose, surroundings, rng.uniform(*noise), rng)
-
-
-def _centres(target: ArticulatedObject, state: Float) -> Float:
-    centres = np.zeros((len(target.bodies), 3))
-    for number, (body, pose) in enumerate(zip(target.bodies, target.body_poses(state), strict=True)):
-        if body.visuals:
-            places = np.concatenate([mesh.vertices for mesh in body.visuals]) @ pose[:3, :3].T + pose[:3, 3]
-            centres[number] = (places.min(axis=0) + places.max(axis=0)) / 2
-    return centres

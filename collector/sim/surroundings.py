@@ -8,6 +8,7 @@ import numpy as np
 from collector.objects.articulation import ArticulatedObject, Body, Mesh
 from collector.objects.procedural.catalogue import build
 from collector.objects.procedural.shapes import block, moved, rod
+from shared.geometry import rotation_about_z
 from shared.types import Float
 
 SMALL_OBJECTS = ("Box", "Bucket", "Kettle", "KitchenPot", "TrashCan")
@@ -22,12 +23,8 @@ ON_THE_SIDES = 0.6
 
 def extent(target: ArticulatedObject, states: Float) -> tuple[Float, Float]:
     """The corners of the box, [3] each, that holds an object in all of some states, [states, parts]."""
-    corners = []
-    for state in states:
-        for body, pose in zip(target.bodies, target.body_poses(state), strict=True):
-            corners += [mesh.vertices @ pose[:3, :3].T + pose[:3, 3] for mesh in body.visuals]
-    points = np.concatenate(corners)
-    return points.min(axis=0), points.max(axis=0)
+    boxes = np.concatenate([target.visible_boxes(state) for state in states])
+    return np.nanmin(boxes[:, 0], axis=0), np.nanmax(boxes[:, 1], axis=0)
 
 
 def draw_surroundings(low: Float, high: Float, camera: Float, rng: np.random.Generator) -> Body:
@@ -69,8 +66,7 @@ def _thing(rng: np.random.Generator) -> tuple[Mesh, ...]:
         every = (*model.body, *(piece for part in model.parts for piece in part.pieces))
         scale = rng.uniform(0.15, 0.35)
         pieces = tuple(Mesh(scale * piece.vertices, piece.faces) for piece in every)
-    turn = rng.uniform(-np.pi, np.pi)
-    rotation = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    rotation = rotation_about_z(rng.uniform(-np.pi, np.pi))
     turned = tuple(Mesh(piece.vertices @ rotation.T, piece.faces) for piece in pieces)
     lowest = min(float(piece.vertices[:, 2].min()) for piece in turned)
     return moved(turned, (0.0, 0.0, -lowest))

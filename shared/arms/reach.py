@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from shared.arms.arm import Arm
 from shared.arms.kinematics import chain_of
-from shared.geometry import gripper_rotation
+from shared.geometry import gripper_rotation, rotation_about_z
 from shared.primitives import START_DISTANCE, PrimitiveSpec
 from shared.types import Action, Float, Observation
 
@@ -24,8 +24,9 @@ ASKED_POINTS = 64
 
 def base_pose(x: float, y: float, z: float, yaw: float) -> Float:
     """world_from_base, [4, 4], of an upright arm that is turned by `yaw`, rad, about z."""
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    return np.array([[cosine, -sine, 0.0, x], [sine, cosine, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_about_z(yaw), (x, y, z)
+    return pose
 
 
 class ArmReach:
