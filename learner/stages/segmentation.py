@@ -1,7 +1,7 @@
 """The segmentation network, trained on labelled scenes (`adaafford objects scenes`)."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,10 +47,9 @@ class Scenes:
     def of(cls, scenes: list[Scene]) -> "Scenes":
         """Scenes stacked, with the neighbours of their points."""
         points = [scene.points for scene in scenes]
-        clouds = CloudBatch.of(points, (group_cloud(each, SEGMENTATION_NETWORK) for each in points))
-        extra = torch.from_numpy(np.stack([scene.extra for scene in scenes]))
+        groupings = (group_cloud(each, SEGMENTATION_NETWORK) for each in points)
         return cls(
-            CloudBatch(clouds.points, clouds.neighbours, clouds.nearest, extra),
+            CloudBatch.of(points, groupings, [scene.extra for scene in scenes]),
             torch.from_numpy(np.stack([scene.kinds for scene in scenes])),
             torch.from_numpy(np.stack([scene.centres for scene in scenes])),
         )
@@ -67,8 +66,7 @@ class Scenes:
         assert clouds.extra is not None, "scenes have further inputs"
         # The first three further inputs are the normal.
         extra = torch.cat([clouds.extra[..., :3] * signs, clouds.extra[..., 3:]], dim=-1)
-        turned = CloudBatch(clouds.points * signs, clouds.neighbours, clouds.nearest, extra)
-        return Scenes(turned, self.kinds, self.centres * signs)
+        return Scenes(replace(clouds, points=clouds.points * signs, extra=extra), self.kinds, self.centres * signs)
 
 
 class SegmentationStage:

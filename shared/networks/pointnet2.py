@@ -46,8 +46,13 @@ class CloudBatch:
         return self.points if self.extra is None else torch.cat([self.points, self.extra], dim=-1)
 
     @classmethod
-    def of(cls, points: Float32 | Sequence[Float32], groupings: Iterable[Grouping]) -> "CloudBatch":
-        """Stack clouds that have one size, and their indices, which are taken one by one."""
+    def of(
+        cls,
+        points: Float32 | Sequence[Float32],
+        groupings: Iterable[Grouping],
+        extra: Sequence[Float32] | None = None,
+    ) -> "CloudBatch":
+        """Stack clouds that have one size, their indices, which are taken one by one, and their further inputs."""
         stacked = np.asarray(points)
         levels: list[NDArray[np.int16]] = []
         for number, grouping in enumerate(groupings):
@@ -57,7 +62,9 @@ class CloudBatch:
             for all_indices, indices in zip(levels, found, strict=True):
                 all_indices[number] = indices
         tensors = tuple(torch.from_numpy(indices) for indices in levels)
-        return cls(torch.from_numpy(stacked), tensors[: len(tensors) // 2], tensors[len(tensors) // 2 :])
+        neighbours, nearest = tensors[: len(tensors) // 2], tensors[len(tensors) // 2 :]
+        further = None if extra is None else torch.from_numpy(np.asarray(extra))
+        return cls(torch.from_numpy(stacked), neighbours, nearest, further)
 
     def select(self, clouds: Tensor) -> "CloudBatch":
         """The clouds at the indices `clouds`, [any]."""

@@ -127,10 +127,8 @@ class Segmenter:
     @torch.no_grad()
     def _evaluated(self, given: SegmentationInput) -> tuple[Float32, Float32]:
         """Probabilities of the kinds, [N, kinds], and the middles that are voted for, [N, 3]."""
-        config = SEGMENTATION_NETWORK
-        clouds = CloudBatch.of([given.points], [group_cloud(given.points, config)])
-        extra = torch.from_numpy(given.extra)[None]
-        logits, offsets = self._network(CloudBatch(clouds.points, clouds.neighbours, clouds.nearest, extra))
+        clouds = CloudBatch.of([given.points], [group_cloud(given.points, SEGMENTATION_NETWORK)], [given.extra])
+        logits, offsets = self._network(clouds)
         return torch.softmax(logits[0], dim=-1).numpy(), given.points + offsets[0].numpy()
 
     def to_files(self) -> dict[str, bytes]:
