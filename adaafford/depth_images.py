@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
+from scipy.spatial.transform import Rotation
 
 from adaafford.npz import read_npy, read_npz
 from adaafford.scans import DEPTH_SUFFIXES, MAX_COORDINATE, MAX_ROWS, Coordinate, Scan, Vector, checked_scan
@@ -68,7 +69,7 @@ class Lens(StrictModel):
         places = np.stack([(columns - cx) / fx * depths, (rows - cy) / fy * depths, depths], axis=-1).reshape(-1, 3)
         measured = depths.ravel() > 0
         if self.pose is not None:
-            places = places @ _rotation_of(self.pose[3:]).T + np.array(self.pose[:3])
+            places = Rotation.from_quat(self.pose[3:]).apply(places) + np.array(self.pose[:3])
         places[~measured] = 0.0
         return places
 
@@ -189,11 +190,3 @@ def _npy(data: bytes) -> NDArray[np.generic]:
 
 _READERS = {".png": _png, ".npy": _npy, ".npz": _npz}
 assert tuple(_READERS) == DEPTH_SUFFIXES
-
-
-def _rotation_of(quaternion: tuple[float, ...]) -> Float:
-    """The rotation, [3, 3], of a quaternion x, y, z, w."""
-    x, y, z, w = np.array(quaternion) / np.linalg.norm(quaternion)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rotation: Float = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-    return rotation

@@ -82,8 +82,8 @@ def _ply(points: Float, affordance: Float32, indices: NDArray[np.uint32], reacha
     rows = np.zeros(len(points), dtype=fields)
     for axis, name in enumerate("xyz"):
         rows[name] = points[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        rows[name] = colours(affordance, reachable)[:, channel]
+    for name, shown in zip(("red", "green", "blue"), colours(affordance, reachable).T, strict=True):
+        rows[name] = shown
     rows["affordance"] = affordance
     if reachable is not None:
         rows["reachable"] = reachable

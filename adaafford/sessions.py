@@ -9,6 +9,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -199,7 +200,7 @@ class Session:
     ) -> None:
         policy.require("prior", "aap", "aip")
         self._choice = None if part is None else part_choice(part)
-        self._task, self._finder = policy.task, None if part is None else PartFinder(policy.task)
+        self._task = policy.task
         if files.heatmap is not None:
             heatmap_writer(files.heatmap)
         self._adapter = Adapter(policy)
@@ -346,7 +347,6 @@ class Session:
         up = self._up or (self._lens.up if self._lens else None) or (0.0, 0.0, 1.0)
         cut = None
         if self._choice is not None:
-            assert self._finder is not None, "a choice needs what finds parts"
             camera = self._camera or scan.camera or (0.0, 0.0, 0.0)
             cut = self._finder.cut_out(scan, up, camera, self._choice, None, str(path))
         frame = ScanFrame.around(scan if cut is None else cut.scan, up, self._camera)
@@ -354,6 +354,11 @@ class Session:
             self._tell(f"{path}: {doubt}; if so, say it by --up and begin another history")
         self._remember(scan, cut, path, sha256, frame, None)
         return History(frame=frame, part=self._choice, lens=self._lens)
+
+    @cached_property
+    def _finder(self) -> PartFinder:
+        """What finds the parts of raw scans; its network is read when the first of these comes."""
+        return PartFinder(self._task)
 
     def _about_the_part(self, history: History) -> History:
         """A history that is there, with the choice of the part that was given now, if nothing was tried before."""
@@ -393,7 +398,6 @@ class Session:
         if (sha256, frame, followed) not in self._seen:
             scan, cut = self._parsed(data, path, history.part, history.lens), None
             if history.part is not None:
-                self._finder = self._finder or PartFinder(self._task)
                 cut = self._finder.cut_out(scan, frame.up, frame.camera, history.part, followed, str(path))
             self._remember(scan, cut, path, sha256, frame, followed)
         return self._seen[sha256, frame, followed]
