@@ -45,6 +45,9 @@ from shared.tasks import task_named
 from shared.types import Action, Observation
 
 PURPOSE = "adapt"
+FINAL_SHARE = 0.01
+"""Of the cloud's points, from the best of which the final action is drawn, as in the published code. In rehearsals with
+real objects, 45% of closed doors moved instead of 30% with a point of the best 100, and 85% of faucets instead of 50%."""
 SURFACE_POINTS = 10_000
 """Of a scan, about, that the links of an arm must not touch."""
 
@@ -251,7 +254,7 @@ class Session:
         action = AipProposer(self._adapter, rng, self._budget).propose(observation, known)
         do: Literal["try", "act"] = "act" if action is None else "try"
         if action is None:
-            action = ExploitProposer(self._adapter, rng).propose(observation, known)
+            action = ExploitProposer(self._adapter, rng, share=FINAL_SHARE).propose(observation, known)
             assert action is not None, "an exploiter never stops"
         trajectory = self._trajectory(observation, action, cloud)
         belief = float(self._adapter.score(observation, [action], known)[0])

@@ -249,7 +249,7 @@ def test_a_policy_is_found_by_folder_file_run_or_name(
         load_policy("push")
 
 
-@pytest.mark.parametrize("name", ["pull-closed-door", "push-faucet"])
+@pytest.mark.parametrize("name", ["pull", "pull-closed-door", "push", "push-faucet"])
 def test_the_package_brings_a_policy_with_its_card(name: str) -> None:
     policy = load_policy(name)
     assert (policy.task, policy.trained) == (name, {"prior", "aap", "aip"})
