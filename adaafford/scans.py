@@ -362,7 +362,8 @@ class ScannedSurface:
         if not apart <= _DENSE_M:
             raise UsageError(
                 f"the policy is told what lies between the fingers, and the points are {apart:.3f} m apart; "
-                "give the scan before it is thinned, with a point every centimetre or closer"
+                "give the scan before it is thinned, with a point every centimetre or closer, or take a policy that is "
+                "not told, such as pull-closed-door-sparse"
             )
         return round_points(self.frame.to_world(points))
 
