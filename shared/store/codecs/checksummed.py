@@ -5,7 +5,7 @@ import json
 from typing import Any
 
 from shared.errors import StoreError
-from shared.io.documents import MAX_VALUES, parse_object
+from shared.io.documents import parse_object
 
 _SEAL = "sha256"
 
@@ -20,13 +20,13 @@ def with_checksum(content: dict[str, Any]) -> bytes:
     return canonical(content | {_SEAL: _checksum(content)})
 
 
-def without_checksum(data: bytes, source: str, values: int = MAX_VALUES) -> dict[str, Any]:
-    """The content of a document that `with_checksum` wrote, of at most so many values.
+def without_checksum(data: bytes, source: str) -> dict[str, Any]:
+    """The content of a document that `with_checksum` wrote.
 
     Raises:
         StoreError: it is not JSON, not an object, or not what was sealed, byte for byte.
     """
-    return checked_content(parse_object(data, source, values), data, source)
+    return checked_content(parse_object(data, source), data, source)
 
 
 def checked_content(content: dict[str, Any], data: bytes, source: str) -> dict[str, Any]:
