@@ -15,7 +15,7 @@ from collector.sim.camera import DepthImage, EmbreeCamera
 from shared.config import CameraConfig
 from shared.errors import UsageError
 from shared.geometry import camera_pose
-from shared.io.files import write_atomically
+from shared.io.files import write_atomically, writing
 from shared.types import Float
 
 BODY_COLOUR = (0.62, 0.62, 0.62)
@@ -67,11 +67,9 @@ def save(figure: Figure, out_png: Path) -> None:
     """
     image = BytesIO()
     figure.savefig(image, format="png")
-    try:
+    with writing(out_png, "name a .png file that can"):
         out_png.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out_png, image.getvalue())
-    except OSError as error:
-        raise UsageError(f"{out_png}: cannot be written ({error.strerror}); name a .png file that can") from None
 
 
 def picture(target: ArticulatedObject, size: int) -> Float:

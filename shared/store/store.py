@@ -16,18 +16,16 @@ from typing import Any
 import pyarrow as pa
 
 from shared.errors import StoreError, UnreadableError, UsageError
+from shared.io.documents import difference_of, with_checksum
 from shared.io.files import TEMPORARY_PREFIX
-from shared.plan import Job, Plan, Setting
-from shared.records import RolloutRecord
+from shared.plan import Job, Plan, RolloutRecord, Setting
 from shared.store import policies, reader
 from shared.store.backends.base import Folder, StorageBackend, backend_of, is_url
 from shared.store.backends.conformance import check_place
 from shared.store.clouds import observations_of, stacked
-from shared.store.codecs.checksummed import with_checksum
 from shared.store.codecs.columns import interaction_columns, rollout_columns
-from shared.store.codecs.digest import combined_digest
 from shared.store.codecs.observations import ObservationArrays
-from shared.store.coverage import Part, parts_of
+from shared.store.coverage import Part, Snapshot, parts_of
 from shared.store.crash_log import CRASH_LOG_FOLDER, CrashLog
 from shared.store.layout import (
     INTERACTIONS_FILE,
@@ -45,12 +43,10 @@ from shared.store.layout import (
     parse_shard_id,
     parse_store_document,
 )
-from shared.store.maintenance.difference import difference_of
 from shared.store.presence import DRIVER
 from shared.store.provenance import store_software
 from shared.store.selection import Condition, Selection
-from shared.store.snapshot import Snapshot
-from shared.store.writer import commit_shard
+from shared.store.writer import combined_digest, commit_shard
 from shared.types import Observation
 
 MAX_SEED = 2**64 - 1

@@ -17,7 +17,7 @@ from cluster.evaluation.rehearsal import SimulatedRobot
 from cluster.evaluation.resimulation import chosen_interactions, resimulate
 from collector.domain_randomisation import draw_arm_base
 from collector.objects.catalogue import load_ref, scan
-from collector.objects.procedural.writing import generate
+from collector.objects.procedural.catalogue import generate
 from collector.objects.surface import POINTS, surface_at
 from collector.setting import make_setting
 from collector.sim.armed import ArmedEnvironment
@@ -36,10 +36,10 @@ from shared.policies.proposers import proposer_named
 from shared.primitives import PRIMITIVES
 from shared.store import Store
 from shared.store.codecs.columns import ROLLOUT_COLUMNS, RolloutRow
-from shared.store.codecs.digest import rollout_digest
 from shared.store.codecs.tables import read_table, table_bytes
 from shared.store.layout import ARM_VERSION
 from shared.store.validity import check_rollouts
+from shared.store.writer import rollout_digest
 from shared.tasks import task_named
 from shared.types import Action, HiddenDynamics, Observation, OutcomeKind
 from tests.adaafford.test_adapt_command import front

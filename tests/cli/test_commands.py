@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cluster.cli.main import COMMANDS, run
-from shared.categories import TEST_CATEGORIES
+from shared.tasks import TEST_CATEGORIES
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *args: str) -> str:

@@ -106,7 +106,7 @@ def _robots(command: RehearseCommand, gripper: str) -> Iterator["SimulatedRobot"
     from cluster.cli.library import simulated
     from cluster.config.objects import built_in_categories
     from cluster.evaluation.rehearsal import Setting, SimulatedRobot
-    from collector.objects.procedural.writing import generate
+    from collector.objects.procedural.catalogue import generate
     from shared.tasks import task_of
 
     make_folder(command.folder)

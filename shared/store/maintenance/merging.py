@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from shared.errors import StoreError, UsageError
+from shared.io.documents import difference_of
 from shared.plan import Job, Plan, parse_plan_key
 from shared.store import reader
 from shared.store.coverage import Part, Window, overlapping, parts_of
-from shared.store.maintenance.difference import difference_of
 from shared.store.presence import alone
 from shared.store.store import Store
 from shared.store.writer import Unknown, commit_shard, copy_shard
@@ -101,11 +101,7 @@ def _agreeing(held: Sequence[_Held]) -> int:
 
 
 def _refuse_overlaps(store: Store, ours: AbstractSet[Job]) -> None:
-    """Refuse a store that holds, in another shard, a rollout that is to be copied into it.
-
-    Raises:
-        StoreError: it does.
-    """
+    """Refuse a store that holds, in another shard, a rollout that is to be copied into it."""
     there = set(store.jobs())
     other = next((job for job in overlapping(there | ours, lambda job: job) if job not in ours), None)
     if other is not None:

@@ -22,9 +22,8 @@ from shared.errors import StoreError
 from shared.store.codecs.columns import INTERACTION_COLUMNS, interaction_columns
 from shared.store.codecs.observations import ObservationArrays
 from shared.store.codecs.tables import joined, schema_of, unknown_columns
-from shared.store.coverage import ROLLOUT_COLUMN, Part
+from shared.store.coverage import ROLLOUT_COLUMN, Part, Snapshot
 from shared.store.maintenance.datacard import SplitFigures
-from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
 GROUP_BYTES = 16 << 20
