@@ -115,6 +115,24 @@ def test_objects_are_made_of_a_group_of_categories(tmp_path: Path) -> None:
     assert made == {name.lower() for name in (*TEST_CATEGORIES, "Box")}
 
 
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["objects", "generate", "DIR", "--per-category", "0"],
+        ["objects", "export", "DIR", "--out", "DIR", "--part-mass", "0"],
+        ["train", "segmentation", "--scenes", "DIR", "--out", "DIR", "--seed", "-1"],
+        ["calibrate", "--policy", "p", "--store", "s", "--out", "DIR", "--seed", "-1"],
+    ],
+)
+def test_a_flag_out_of_bounds_is_refused_in_one_line(
+    args: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = complaint(capsys, *(str(tmp_path) if word == "DIR" else word for word in args))
+    assert args[-2].strip("-").replace("-", "_") in line
+    assert "Input should be greater than" in line
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["--version"]) == 0
     assert capsys.readouterr().out.strip()[0].isdigit()
