@@ -28,6 +28,7 @@ from shared.store.codecs.columns import (
 )
 from shared.store.codecs.observations import Packed, pack
 from shared.store.codecs.tables import table_bytes
+from shared.store.coverage import Part
 from shared.store.layout import (
     INTERACTIONS_FILE,
     MANIFEST_FILE,
@@ -46,7 +47,7 @@ from shared.store.layout import (
     schema_version,
 )
 from shared.store.provenance import process_provenance, store_software
-from shared.store.reader import is_committed, read_files, read_manifest, read_rollouts, shard_folder
+from shared.store.reader import is_committed, read_files, read_manifest, read_rollouts, shard_folder, unknown_of
 from shared.store.validity import check_quarantined, check_rollouts
 
 Row = TypeVar("Row")
@@ -163,6 +164,31 @@ def commit_shard(
     described = manifest.as_document() | dict(unknown.fields)
     _publish(backend, parse_manifest(with_checksum(described), str(shard)), files, vetted=vetted)
     return read_manifest(shard)
+
+
+def commit_part(backend: StorageBackend, source: Folder, manifest: ShardManifest, part: Part, note: str) -> None:
+    """Commit some of a shard's rollouts as a shard of their own, in the same store or in another.
+
+    Args:
+        backend: of the store that gets them.
+        source: the shard.
+        manifest: of the source.
+        part: which rollouts.
+        note: what the provenance calls the shard that they are from.
+
+    Raises:
+        StoreError: the source is damaged.
+    """
+    commit_shard(
+        backend,
+        part.job,
+        read_rollouts(source, manifest)[part.start - manifest.start : part.stop - manifest.start],
+        manifest.points,
+        manifest.provenance | {note: manifest.shard_id},
+        [each for each in manifest.quarantined if part.start <= each.rollout < part.stop],
+        vetted=True,
+        unknown=Unknown({file: part.of(table) for file, table in unknown_of(source, manifest).items()}, manifest.more),
+    )
 
 
 def copy_shard(source: Folder, manifest: ShardManifest, backend: StorageBackend) -> None:

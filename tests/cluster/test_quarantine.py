@@ -149,7 +149,7 @@ def test_a_kill_while_shards_are_reopened_loses_and_doubles_nothing(
     fill(disturbed, {5: "raise"})
     fill(undisturbed, {})
     before = disturbed.digest()
-    for step in ("commit_shard", "set_aside"):
+    for step in ("commit_part", "set_aside"):
         with monkeypatch.context() as patch:
             patch.setattr(compaction, step, lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
             with pytest.raises(KeyboardInterrupt):

@@ -17,8 +17,7 @@ from shared.config import CameraConfig
 from shared.errors import UsageError
 from shared.geometry import camera_pose
 from shared.seeds import generator
-from shared.segmentation.inputs import POINTS, network_input
-from shared.segmentation.planes import floor_and_walls
+from shared.segmentation.inputs import POINTS, floor_and_walls, network_input
 from shared.segmentation.scenes import MOVABLE, Kind, read_scene, scene_path
 
 

@@ -16,7 +16,7 @@ from shared.store.layout import MAX_ALL_PIXELS, MAX_ALL_POINTS, MAX_ROWS, SHARDS
 from shared.store.maintenance.repair import set_aside
 from shared.store.presence import alone
 from shared.store.store import Store
-from shared.store.writer import Unknown, commit_shard
+from shared.store.writer import Unknown, commit_part, commit_shard
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,24 +151,13 @@ def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
         manifest = store.manifest(part.shard)
         if not manifest.quarantined:
             continue
-        rollouts = store.read_rollouts(manifest.shard_id)
-        unknown = reader.unknown_of(reader.shard_folder(store.backend, manifest.shard_id), manifest)
+        shard, rollouts = reader.shard_folder(store.backend, manifest.shard_id), store.read_rollouts(manifest.shard_id)
         wanted = {rollout.index for rollout in rollouts if rollout.status is RolloutStatus.QUARANTINED}
         kept = [Job(manifest.plan_key, *ends) for ends in _ranges(manifest.start, manifest.stop, wanted)]
         # What a compaction has not set aside yet holds these rollouts as well.
         old = [job for job in store.jobs(manifest.plan_key) if job.start < manifest.stop and manifest.start < job.stop]
         for job in kept:
-            rest = Part(manifest.job, job.start, job.stop)
-            commit_shard(
-                store.backend,
-                job,
-                rollouts[job.start - manifest.start : job.stop - manifest.start],
-                manifest.points,
-                {**manifest.provenance, "split_from": manifest.shard_id},
-                (),
-                vetted=True,
-                unknown=Unknown({file: rest.of(table) for file, table in unknown.items()}, manifest.more),
-            )
+            commit_part(store.backend, shard, manifest, Part(manifest.job, job.start, job.stop), "split_from")
         for job in sorted(set(old) - set(kept), key=lambda job: job.stop - job.start):
             set_aside(store.backend, f"{SHARDS_FOLDER}/{job.shard_id}")
         count += len(wanted)

@@ -12,7 +12,7 @@ from shared.store import reader
 from shared.store.coverage import Part, Window, overlapping, parts_of
 from shared.store.presence import alone
 from shared.store.store import Store
-from shared.store.writer import Unknown, commit_shard, copy_shard
+from shared.store.writer import commit_part, copy_shard
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,18 +115,5 @@ def _copy(store: Store, source: Store, part: Part) -> None:
     manifest = reader.read_manifest(shard)
     if part.is_whole:
         copy_shard(shard, manifest, store.backend)
-        return
-    rollouts = reader.read_rollouts(shard, manifest)[part.start - manifest.start : part.stop - manifest.start]
-    commit_shard(
-        store.backend,
-        part.job,
-        rollouts,
-        manifest.points,
-        manifest.provenance | {"merged_from": manifest.shard_id},
-        [each for each in manifest.quarantined if part.start <= each.rollout < part.stop],
-        vetted=True,
-        unknown=Unknown(
-            {file: part.of(table) for file, table in reader.unknown_of(shard, manifest).items()},
-            manifest.more,
-        ),
-    )
+    else:
+        commit_part(store.backend, shard, manifest, part, "merged_from")
