@@ -121,7 +121,6 @@ def test_objects_are_made_of_a_group_of_categories(tmp_path: Path) -> None:
         ["objects", "generate", "DIR", "--per-category", "0"],
         ["objects", "export", "DIR", "--out", "DIR", "--part-mass", "0"],
         ["train", "segmentation", "--scenes", "DIR", "--out", "DIR", "--seed", "-1"],
-        ["calibrate", "--policy", "p", "--store", "s", "--out", "DIR", "--seed", "-1"],
     ],
 )
 def test_a_flag_out_of_bounds_is_refused_in_one_line(

@@ -3,10 +3,9 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
-from pydantic import Field
 
 from cluster.config.flags import parse_flags
 from shared.errors import UsageError
@@ -28,7 +27,7 @@ class CalibrateCommand:
     """Folder to write the policy to; files of an earlier export are replaced, and nothing else may lie there."""
     fit: Literal["scale", "last-layer"] = "scale"
     """What is fitted of each critic. "scale": a temperature and a bias; "last-layer": all weights of its last layer."""
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: int = 0
     """Of what is drawn."""
     licence: str = "MIT"
     """What the card says; weights that were fitted to others' objects may be bound by those objects' terms."""
@@ -41,6 +40,8 @@ def main(args: list[str]) -> int:
     command = parse_flags(
         CalibrateCommand, args, "calibrate", CalibrateCommand(tyro.MISSING, tyro.MISSING, tyro.MISSING)
     )
+    if command.seed < 0:
+        raise UsageError(f"--seed {command.seed}: give a number of 0 or more")
     from adaafford.pretrained import load_policy
     from cluster.reporting.calibration_card import as_json, as_markdown, calibrated, calibrated_files
     from cluster.reporting.model_card import check_export_folder, write_export
