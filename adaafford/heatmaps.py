@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import UsageError
-from shared.io.files import write_atomically
+from shared.io.files import write_atomically, writing
 from shared.types import Float, Float32
 
 Writer = Callable[[Float, Float32, NDArray[np.uint32], NDArray[np.bool_] | None], bytes]
@@ -37,10 +37,8 @@ def write_heatmap(
         UsageError: the suffix is not allowed, or the folder cannot be written to.
     """
     writer = heatmap_writer(path)
-    try:
+    with writing(path):
         write_atomically(path, writer(points, affordance, indices, reachable))
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror}); name another place") from None
 
 
 def heatmap_writer(path: Path) -> Writer:

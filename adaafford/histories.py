@@ -30,7 +30,7 @@ from adaafford.scans import ScanFrame, Vector, action_at
 from shared.config import StrictModel
 from shared.errors import UsageError
 from shared.io.documents import named_twice
-from shared.io.files import read_bounded, write_atomically
+from shared.io.files import read_bounded, write_atomically, writing
 from shared.types import MAX_GRASP_WIDTH, Action, Interaction, Observation, Outcome, OutcomeKind
 
 MAX_HISTORY_BYTES = 1 << 20
@@ -241,10 +241,8 @@ def write_history(path: Path, history: History) -> None:
     Raises:
         UsageError: the folder is not writable.
     """
-    try:
+    with writing(path):
         write_atomically(path, history.model_dump_json(indent=2).encode() + b"\n")
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror}); name another place") from None
 
 
 def _rounded(vector: list[float]) -> Vector:

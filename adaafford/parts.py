@@ -16,7 +16,7 @@ from shared.config import StrictModel
 from shared.errors import UsageError
 from shared.io.files import read_bounded
 from shared.policies.policy import MAX_WEIGHTS_BYTES, WEIGHTS_FILE
-from shared.segmentation.kinds import MOVABLE, Kind
+from shared.segmentation.scenes import MOVABLE, Kind
 from shared.segmentation.segmenter import MAX_DOCUMENT_BYTES, SEGMENTATION_FILE, Part, Segmentation, Segmenter
 from shared.tasks import TASKS
 from shared.types import Float, Float32

@@ -14,7 +14,7 @@ from pydantic import Field
 from benchmarks.script import main
 from cluster.cli.benchmarks.collecting import collect, jobs_of
 from cluster.cli.commands.bench import BenchSettings, planned
-from learner.evaluation.bootstrap import ratio_interval
+from learner.metrics import ratio_interval
 from shared.formatting import percent
 from shared.plan import Plan
 from shared.progress import Progress

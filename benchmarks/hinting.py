@@ -20,15 +20,15 @@ from adaafford import load_policy
 from benchmarks.script import check_picture, main
 from cluster.cli.commands.bench import StoredSettings, source_of, stored
 from cluster.reporting.picture import Panel, draw_panels
-from cluster.reporting.words import verdict
+from cluster.reporting.style import verdict
 from cluster.runs.warm_start import seen_by, unknown
-from learner.evaluation.bootstrap import ratio_interval
+from learner.metrics import ratio_interval
 from shared.errors import UsageError
 from shared.formatting import percent
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
 from shared.progress import Advance, Progress
-from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
 from shared.types import Float, Float32, Interaction, Observation, Outcome
 

@@ -13,11 +13,10 @@ from typing import Any
 
 import psutil
 
-from shared.plan import Job, missing_ranges
+from shared.io.documents import with_checksum
+from shared.plan import Job, RolloutRecord, missing_ranges
 from shared.progress import Advance
-from shared.records import RolloutRecord
 from shared.store import Store
-from shared.store.codecs.checksummed import with_checksum
 from shared.store.layout import MANIFEST_FILE
 
 COMMITS = 7

@@ -30,9 +30,8 @@ from collector.sim.grippers import panda_shape
 from shared.errors import UsageError, WorkerError
 from shared.geometry import quaternion_from_rotation
 from shared.io.interpreter import own_environment
-from shared.plan import Plan
+from shared.plan import Plan, RolloutRecord
 from shared.primitives import hand_start
-from shared.records import RolloutRecord
 from shared.store import Store
 
 SCRIPT = Path(__file__).with_name("peer_trials.py")

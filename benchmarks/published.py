@@ -19,8 +19,8 @@ from cluster.cli.commands.bench import BenchSettings, planned, print_collection
 from collector.objects.partnet import urdf_of
 from shared.errors import WorkerError
 from shared.io.interpreter import PYTHON, own_environment
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.progress import Progress
-from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
 
 LIMIT_S = 600.0

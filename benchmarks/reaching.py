@@ -19,8 +19,8 @@ from benchmarks.script import main
 from cluster.cli.commands.bench import BenchSettings, planned
 from cluster.reporting.collecting import wilson
 from collector.domain_randomisation import object_of
+from collector.objects.articulation import surface_at
 from collector.objects.cache import ObjectCache
-from collector.objects.surface import surface_at
 from collector.random_proposer import RandomProposer
 from collector.rollout import Start, begin
 from collector.sim.armed import ArmedEnvironment

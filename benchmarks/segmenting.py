@@ -30,12 +30,12 @@ from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import load, of_categories, scan
 from collector.sim.raw_scan import RawScan, random_scan
 from shared import seeds
-from shared.categories import expanded
 from shared.errors import UsageError
 from shared.io.files import make_folder
 from shared.progress import Progress
-from shared.segmentation.kinds import MOVABLE
+from shared.segmentation.scenes import MOVABLE
 from shared.segmentation.segmenter import Segmentation, Segmenter
+from shared.tasks import expanded
 
 SEEN_POINTS = 150
 """A part of which fewer points are scanned is not asked for."""

@@ -18,9 +18,8 @@ from benchmarks.s3_server import loopback_bucket
 from benchmarks.script import main
 from cluster.cli.commands.bench import StoredSettings, source_of, stored
 from shared.errors import StoreError
-from shared.plan import Job
+from shared.plan import Job, RolloutRecord
 from shared.progress import Advance, Progress
-from shared.records import RolloutRecord
 from shared.store import Store, info
 from shared.store.layout import MAX_DOCUMENT_BYTES, SHARDS_FOLDER
 

@@ -17,11 +17,6 @@ class WorkerActor:
     The worker is created in the first job, not in `__init__`, so that a problem with a store or a folder reaches the
     driver as the exception of the job. After any failure the driver replaces the process, because the engine may be in
     any state and memory may have grown.
-
-    Args:
-        make_worker: creates the worker.
-        crash_log: receives heartbeats.
-        limits: of time and memory.
     """
 
     def __init__(self, make_worker: WorkerFactory, crash_log: CrashLog, limits: Limits) -> None:

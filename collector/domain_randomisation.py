@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from collector.objects.articulation import ArticulatedObject
-from collector.objects.surface import surface_at
+from collector.objects.articulation import ArticulatedObject, surface_at
 from shared import seeds
 from shared.config import DynamicsRanges, Range
 from shared.hidden import ALWAYS_DRAWN

@@ -10,8 +10,8 @@ from collector.random_proposer import RandomProposer
 from collector.sim.simulator import SimEnvironment
 from collector.stopwatch import StageClock
 from shared.geometry import quaternion_from_rotation
+from shared.plan import InteractionRecord
 from shared.primitives import hand_start
-from shared.records import InteractionRecord
 from shared.types import Action, Float, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role
 
 

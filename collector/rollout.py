@@ -14,8 +14,7 @@ from collector.sim.simulator import SIMULATORS, SimEnvironment
 from collector.stopwatch import StageClock
 from shared import seeds
 from shared.geometry import camera_pose
-from shared.plan import Plan
-from shared.records import RolloutRecord, RolloutStatus
+from shared.plan import Plan, RolloutRecord, RolloutStatus
 from shared.types import Order, Proposer, Role
 
 TRIES = 8

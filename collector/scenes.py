@@ -13,9 +13,9 @@ from shared import seeds
 from shared.errors import UsageError
 from shared.io.files import make_folder, write_atomically
 from shared.segmentation.inputs import network_input
-from shared.segmentation.kinds import Kind
 from shared.segmentation.scenes import (
     SCENES_FILE,
+    Kind,
     Scene,
     SceneObject,
     ScenesDocument,

@@ -40,12 +40,7 @@ class Limits:
 
 
 class Watchdog:
-    """Watches this process, which only executes jobs.
-
-    Args:
-        crash_log: receives heartbeats and tracebacks.
-        limits: of time and memory.
-    """
+    """Watches this process, which only executes jobs."""
 
     def __init__(self, crash_log: CrashLog, limits: Limits) -> None:
         self._crash_log = crash_log

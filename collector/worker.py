@@ -21,12 +21,10 @@ from collector.setting import check_packages
 from collector.stopwatch import StageClock
 from collector.watchdog import UnderWay
 from shared.io.redaction import without_places
-from shared.plan import Job, Plan
+from shared.plan import Job, Plan, RolloutRecord, RolloutStatus
 from shared.policies.methods import PROPOSERS, needs_policy
-from shared.records import RolloutRecord, RolloutStatus
-from shared.reproduction import OBJECTS, STORE, reproduction
 from shared.store import Quarantined, Store
-from shared.store.layout import MAX_REASON
+from shared.store.layout import MAX_REASON, OBJECTS, STORE, reproduction
 from shared.store.provenance import note_machine
 from shared.types import Proposer
 

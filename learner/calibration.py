@@ -20,13 +20,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.data.cached_features import FrozenAap
 from learner.data.dataset import Dataset
-from learner.data.features import FrozenFeatures
+from learner.data.features import FrozenAap, FrozenFeatures
 from learner.data.sampling import spread
-from learner.evaluation.bootstrap import ratio_interval
 from learner.evaluation.curve import Candidates, tries_by_aip
-from learner.metrics import cross_entropies
+from learner.metrics import cross_entropies, ratio_interval
 from shared.errors import UsageError
 from shared.networks.layers import Head
 from shared.policies.policy import Policy
@@ -167,10 +165,6 @@ def calibrate(
 
 def check(labels: NDArray[np.bool_], objects: NDArray[np.str_]) -> None:
     """Refuse interactions that are too few to calibrate on.
-
-    Args:
-        labels: whether each succeeded.
-        objects: whose it was.
 
     Raises:
         UsageError: with what there is, and what is needed.

@@ -28,9 +28,9 @@ from shared.io.documents import read_document
 from shared.io.files import read_bounded, write_atomically
 from shared.policies.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
 from shared.store.backends.base import backend_of
+from shared.store.coverage import Snapshot
 from shared.store.layout import MAX_DOCUMENT_BYTES, SHARDS_FOLDER, STORE_FILE, parse_shard_id
 from shared.store.policies import MAX_VERSION, version_of
-from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
 LINE_S = 60.0

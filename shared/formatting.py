@@ -59,12 +59,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int
 
 
 def csv_table(rows: Sequence[Mapping[str, Any]], left_out: Iterable[str] = ()) -> str:
-    """A CSV file with a line for each row, in full precision; the first row names the columns.
-
-    Args:
-        rows: cells by name.
-        left_out: columns that are not written.
-    """
+    """A CSV file with a line for each row, in full precision; the first row names the columns."""
     names = [name for name in (rows[0] if rows else ()) if name not in frozenset(left_out)]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -1,9 +1,10 @@
-"""Tasks: a primitive, the parts that it acts on, start states, and hidden dynamics.
+"""Tasks: a primitive, the parts that it acts on, start states, and hidden dynamics; and categories of objects.
 
 The paper's tasks are built in. Packages add others by entry points of the group "adaafford.tasks", and a TOML file that
 is named on the command line defines one of its own (docs/extending.md).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -144,3 +145,28 @@ def read_task(file: Path) -> Task:
     if task.name in TASKS.names():
         raise UsageError(f"{file}: there is already a task '{task.name}'; choose another name")
     return task
+
+
+TRAIN_CATEGORIES = (
+    "StorageFurniture",
+    "Faucet",
+    "Box",
+    "Microwave",
+    "Refrigerator",
+    "Door",
+    "TrashCan",
+    "Kettle",
+    "Switch",
+    "Window",
+)
+"""Some shapes of each are trained on; the others are tested on."""
+TEST_CATEGORIES = ("Table", "WashingMachine", "Bucket", "KitchenPot", "Safe")
+"""Never trained on."""
+GROUPS = {"train": TRAIN_CATEGORIES, "test": TEST_CATEGORIES}
+"""Names that stand for several categories."""
+
+
+def expanded(names: Iterable[str]) -> tuple[str, ...]:
+    """`names`, of which one may hold several with commas; "train" and "test" stand for the paper's; each once."""
+    single = (part for name in names for part in name.split(",") if part)
+    return tuple(dict.fromkeys(category for name in single for category in GROUPS.get(name, (name,))))

@@ -56,10 +56,6 @@ class Campaign:
     """One run, which starts or continues and ends with its report.
 
     It implements `Rollouts` for its alternation, because it collects them itself.
-
-    Args:
-        run: its folder.
-        config: its settings.
     """
 
     _worker_group: CurrentWorkerGroup

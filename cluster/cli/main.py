@@ -14,8 +14,7 @@ from types import TracebackType
 from typing import NoReturn
 
 import adaafford  # noqa: F401 - it sees first that nothing shadows our packages.
-from cluster.runs.logs import configure
-from cluster.runs.streams import Streams
+from cluster.runs.streams import Streams, configure
 from shared.errors import AdaAffordError, UsageError
 from shared.extras import extra_of, missing_line, require
 from shared.io.redaction import without_secrets

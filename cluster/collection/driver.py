@@ -9,15 +9,14 @@ from pathlib import Path
 
 from cluster.collection.status_writer import DriverStatus, State, status_kept
 from cluster.collection.tally import CollectionProgress, Tally, describe_empty
-from cluster.workers.job_queue import RolloutQueue
-from cluster.workers.policy_source import PolicySource
+from cluster.workers.job_queue import PolicySource, RolloutQueue
 from cluster.workers.retries import JobError
 from cluster.workers.worker_group import WorkerGroup
 from shared.errors import WorkerError
 from shared.io.files import process_name
 from shared.plan import Plan, covered, missing_ranges, parse_plan_key
-from shared.reproduction import reproduction
 from shared.store import Store, reopen_quarantined
+from shared.store.layout import reproduction
 from shared.store.maintenance.info import quarantined_in
 
 OpenWorkerGroup = Callable[[], WorkerGroup]

@@ -4,8 +4,7 @@ from pathlib import Path
 
 from pydantic import Field, field_validator, model_validator
 
-from cluster.config.selection import ObjectSelection
-from cluster.config.worker_settings import WorkerSettings
+from cluster.config.command_settings import ObjectSelection, WorkerSettings
 from learner.settings import LearnerSettings
 from shared.config import CollectionConfig, StrictModel
 from shared.plan import ROLLOUTS_PER_SHARD, EvaluationConfig

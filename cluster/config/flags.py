@@ -2,13 +2,13 @@
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import GenericAlias
 from typing import Any, TypeVar, get_args
 
 import tyro
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
@@ -151,6 +151,9 @@ def parse_flags(
         parsed = tyro.cli(
             command, prog=f"{program}{prog}", args=args, default=default, config=FLAG_STYLE, registry=FLAG_TYPES
         )
+        if is_dataclass(parsed):
+            # tyro does not look at the bounds of a dataclass's own fields.
+            TypeAdapter(command).validate_python({each.name: getattr(parsed, each.name) for each in fields(parsed)})
     except ValidationError as error:
         problem = error.errors()[0]
         if isinstance(cause := problem.get("ctx", {}).get("error"), UsageError):

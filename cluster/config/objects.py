@@ -5,15 +5,13 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from cluster.config.campaign_config import SplitConfig
-from cluster.config.selection import ObjectSelection
+from cluster.config.command_settings import ObjectSelection
 from collector.objects.catalogue import Catalogue, ObjectSplit, for_task, of_categories, read_list, scan, split
-from collector.objects.procedural.catalogue import EVERY_CATEGORY, categories_of
-from collector.objects.procedural.writing import generate
-from shared.categories import expanded
+from collector.objects.procedural.catalogue import EVERY_CATEGORY, categories_of, generate
 from shared.errors import UsageError
 from shared.io.text import short
 from shared.plan import ObjectRef
-from shared.tasks import Task
+from shared.tasks import Task, expanded
 
 MOST_NOTED = 10
 """Objects of which a command says what was left out of their files."""

@@ -11,8 +11,8 @@ from collector.objects.catalogue import load_ref
 from collector.sim.restoration import refuse_other_simulators, restored
 from collector.sim.trial import Trial
 from shared.errors import StoreError, UsageError
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.primitives import PRIMITIVES
-from shared.records import InteractionRecord, RolloutRecord
 from shared.seeds import generator
 from shared.store import Store
 from shared.types import Float, Outcome, OutcomeKind

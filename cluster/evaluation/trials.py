@@ -6,9 +6,9 @@ from itertools import islice
 
 import numpy as np
 
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.policies.adaptation import Adapter
 from shared.policies.methods import MethodName
-from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
 from shared.types import Interaction, Observation, Role
 

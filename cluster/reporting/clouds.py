@@ -66,13 +66,7 @@ def proposed(action: Action) -> Arrow:
 
 
 def draw_panels(panels: Sequence[CloudView], columns: int, scales: Sequence[str]) -> go.Figure:
-    """Clouds side by side, all in the same frame and seen from where the camera of the first stood.
-
-    Args:
-        panels: row by row.
-        columns: of the grid.
-        scales: what each colour scale shows.
-    """
+    """Clouds side by side, all in the same frame and seen from where the camera of the first stood."""
     rows = -(-len(panels) // columns)
     figure = make_subplots(
         rows,

@@ -26,11 +26,6 @@ Summary = Mapping[str, Any]
 def collection_section(summary: Summary, store: Store, run_log: RunLog) -> Section:
     """The statistics of a run's collection.
 
-    Args:
-        summary: what summary.json says.
-        store: the interactions.
-        run_log: of the run.
-
     Raises:
         StoreError: a manifest is damaged or foreign.
     """

@@ -1,9 +1,10 @@
 """Counterfactuals: one hidden fact is varied, the same actions are executed, and the affordance is adapted.
 
-The observation is the same for every value, so differences of the affordance were learned from the interactions.
+The observation is the same for every value, so differences of the affordance were learned from the interactions. The
+hidden facts are friction, mass, direction and hinge side, one at a time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import sqrt
@@ -11,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.reporting.words import number, turning
+from cluster.reporting.clouds import CloudView, draw_panels, tried
+from cluster.reporting.page import Drawing, Section, plain, shortened
+from cluster.reporting.style import after, number, turning
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import load_ref
 from collector.objects.procedural.assembly import normalised
@@ -72,12 +75,7 @@ class Posterior:
 
 
 class Counterfactuals:
-    """Runs the experiments with the task, camera, fidelity and policy of a run.
-
-    Args:
-        setting: of the run's evaluation.
-        adapter: its policy.
-    """
+    """Runs the experiments with the task, camera, fidelity and policy of a run."""
 
     def __init__(self, setting: Setting, adapter: Adapter) -> None:
         self.setting = setting
@@ -179,3 +177,53 @@ def first_readable(folder: Path, refs: Sequence[ObjectRef], setting: Setting) ->
 def _middle(interval: Range) -> float:
     """The middle of what is drawn from: the geometric one where the logarithm is uniform."""
     return sqrt(interval.low * interval.high) if interval.log else (interval.low + interval.high) / 2
+
+
+def hidden_facts_section(
+    counterfactuals: Counterfactuals,
+    target: ArticulatedObject | None,
+    twins: Sequence[ArticulatedObject],
+    say: Callable[[str], None],
+) -> Section:
+    """A tab for each hidden fact, and in it a cloud for each of its values (AdaAfford, Fig. 4)."""
+    key, title = "hidden-facts", "Affordance under hidden facts"
+    if target is None:
+        return Section(key, title, ("No test object of the run can be read any more, so nothing was simulated.",))
+    found = variations(counterfactuals.setting, target, twins)
+    drawings = []
+    for place, variation in enumerate(found, start=1):
+        say(f"simulating hidden facts, {place} of {len(found)}: {variation.name}")
+        posteriors = counterfactuals.posteriors(variation)
+        if posteriors:
+            drawings.append(_drawing(variation.name, posteriors, counterfactuals.adapter))
+    if not drawings:
+        return Section(key, title, (f"No interaction with {target.ref.id} was possible.",))
+    lead = (
+        f"{shortened(target.ref.category)} {target.ref.id}, not seen in training"
+        + (" (for the hinge's side: one cabinet, hung on its left and on its right)" if twins else "")
+        + f". The first cloud is before any interaction. The others are after the same {TRIES} interactions under each "
+        "value (green: success, red: failure), with all other hidden facts at the middle of their range. The camera "
+        "sees the same in every cloud of a row, so differences in colour were learned from the interactions. Drag a "
+        "cloud to turn all.",
+    )
+    return Section(key, title, lead, drawings=tuple(drawings))
+
+
+def _drawing(name: str, posteriors: Sequence[Posterior], adapter: Adapter) -> Drawing:
+    first = posteriors[0].observation
+    panels = [CloudView(f"{after(0)}<br>&nbsp;", first, adapter.affordance(first, []))]
+    panels += [
+        CloudView(
+            f"{plain(each.label)}<br>{_successes(each)}",
+            each.observation,
+            each.affordance,
+            tuple(tried(interaction) for interaction in each.history),
+        )
+        for each in posteriors
+    ]
+    return Drawing(draw_panels(panels, len(panels), ("AAP: affordance",)), tab=name, solid=True)
+
+
+def _successes(posterior: Posterior) -> str:
+    count = sum(interaction.outcome.success for interaction in posterior.history)
+    return f"{count} of {len(posterior.history)} interactions succeeded"

@@ -66,12 +66,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture.
-
-    Attributes:
-        png: its bytes.
-        caption: what it shows.
-    """
+    """A picture."""
 
     png: bytes
     caption: str

@@ -11,7 +11,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from cluster.evaluation.trials import first_trials, most_telling
-from cluster.reporting.words import hidden, verdict
+from cluster.reporting.style import hidden, verdict
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
 from shared.store import Store

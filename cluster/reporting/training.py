@@ -1,6 +1,5 @@
 """Training curves, from the metrics.jsonl that every stage of training leaves."""
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from plotly.subplots import make_subplots
 from cluster.reporting.page import Drawing, Section, plain
 from cluster.reporting.style import SEQUENCE, laid_out
 from shared.errors import StoreError
+from shared.io.documents import json_lines
 from shared.io.files import read_bounded
 
 METRICS_FILE = "metrics.jsonl"
@@ -60,15 +60,10 @@ def read_entries(path: Path) -> list[Entry]:
         StoreError: the file is too large to be ours.
     """
     entries: list[Entry] = []
-    for line in read_bounded(path, MAX_METRICS_BYTES).splitlines():
-        try:
-            entry = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(entry, dict):
-            numbers = {name: number for name, value in entry.items() if math.isfinite(number := _number(value))}
-            if "step" in numbers:
-                entries.append(numbers)
+    for entry in json_lines(read_bounded(path, MAX_METRICS_BYTES).splitlines()):
+        numbers = {name: number for name, value in entry.items() if math.isfinite(number := _number(value))}
+        if "step" in numbers:
+            entries.append(numbers)
     return entries
 
 

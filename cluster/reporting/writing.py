@@ -9,11 +9,10 @@ from cluster.config.campaign_config import CampaignConfig
 from cluster.evaluation.tables import RESULTS_FILE
 from cluster.evaluation.trials import first_trials, most_telling
 from cluster.reporting.collecting import collection_section
-from cluster.reporting.failures import failures_section
 from cluster.reporting.page import Page, Picture, Section, render, shortened
-from cluster.reporting.proposals import proposals_section
 from cluster.reporting.results import Results, further_section, read_results, results_section, tiles
 from cluster.reporting.training import training_section
+from cluster.reporting.trial_sections import failures_section, proposals_section
 from cluster.runs.run_folder import RunFolder, read_json
 from cluster.runs.run_log import RunLog
 from shared.errors import UsageError
@@ -78,8 +77,7 @@ def _further(run: RunFolder) -> list[tuple[str, Results]]:
 
 def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Callable[[str], None]) -> Section:
     # Only here, since they need the simulator.
-    from cluster.reporting.counterfactuals import Counterfactuals, first_readable, hinge_twins
-    from cluster.reporting.hidden_facts import hidden_facts_section
+    from cluster.reporting.counterfactuals import Counterfactuals, first_readable, hidden_facts_section, hinge_twins
 
     used, setting = run.objects_used(), evaluation.setting
     try:

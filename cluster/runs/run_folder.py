@@ -27,11 +27,10 @@ from typing import Any
 from cluster.config.campaign_config import EXECUTION_SETTINGS, CampaignConfig
 from shared.config import StrictModel, parse
 from shared.errors import UsageError
-from shared.io.documents import parse_object
+from shared.io.documents import differences, parse_object
 from shared.io.files import create_exclusively, read_bounded, write_atomically
 from shared.plan import ObjectRef
 from shared.software import software_versions
-from shared.store.maintenance.difference import differences
 
 MAX_DOCUMENT_BYTES = 64 << 20
 PLACE_SETTINGS = ("objects", "object_list", "start_from", "splits.train_list", "splits.test_list", "ray_address")
@@ -55,71 +54,42 @@ class ObjectsUsed(StrictModel):
         return (*self.train, *self.validation, *self.test)
 
 
+class _Within:
+    """The path of something in a run's folder."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, run: "RunFolder", _: object = None) -> Path:
+        return run.path / self._name
+
+
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """Paths within a run."""
+    """Paths within a run, as the list above describes them."""
 
     path: Path
 
-    @property
-    def config(self) -> Path:
-        """config.json."""
-        return self.path / "config.json"
-
-    @property
-    def places(self) -> Path:
-        """places.json."""
-        return self.path / "places.json"
-
-    @property
-    def objects_file(self) -> Path:
-        """objects.json."""
-        return self.path / "objects.json"
-
-    @property
-    def generated_objects(self) -> Path:
-        """Procedural objects."""
-        return self.path / "objects"
-
-    @property
-    def store(self) -> Path:
-        """The interactions."""
-        return self.path / "store"
-
-    @property
-    def evaluation(self) -> Path:
-        """The evaluation's interactions."""
-        return self.path / "evaluation"
-
-    @property
-    def log(self) -> Path:
-        """The run log."""
-        return self.path / "log.jsonl"
-
-    @property
-    def summary(self) -> Path:
-        """summary.json."""
-        return self.path / "summary.json"
-
-    @property
-    def picture(self) -> Path:
-        """affordance.png."""
-        return self.path / "affordance.png"
+    config = _Within("config.json")
+    places = _Within("places.json")
+    objects_file = _Within("objects.json")
+    generated_objects = _Within("objects")
+    store = _Within("store")
+    evaluation = _Within("evaluation")
+    evaluations = _Within("evaluations")
+    """What `adaafford evaluate` makes, a folder each."""
+    trainings = _Within("training")
+    adopted = _Within("training/adopted")
+    """The policy that the run started from, if there is one (`cluster.runs.warm_start`)."""
+    log = _Within("log.jsonl")
+    summary = _Within("summary.json")
+    picture = _Within("affordance.png")
+    page = _Within("report.html")
 
     @property
     def oracle(self) -> Path:
         """The training stage that may have left an oracle."""
         return self.adopted if self.adopted.is_dir() else self.training("aap-1")
-
-    @property
-    def adopted(self) -> Path:
-        """The policy that the run started from, if there is one (`cluster.runs.warm_start`)."""
-        return self.training("adopted")
-
-    @property
-    def page(self) -> Path:
-        """report.html."""
-        return self.path / "report.html"
 
     def are_novel(self, tested: Iterable[ObjectRef]) -> bool:
         """Whether the objects have only categories that were not trained on; unknown for an adopted policy."""
@@ -130,16 +100,6 @@ class RunFolder:
     def training(self, stage: str) -> Path:
         """The folder of a training stage."""
         return self.trainings / stage
-
-    @property
-    def trainings(self) -> Path:
-        """The folder of all training stages."""
-        return self.path / "training"
-
-    @property
-    def evaluations(self) -> Path:
-        """The folder of the evaluations by `adaafford evaluate`."""
-        return self.path / "evaluations"
 
     def objects_folder(self) -> Path:
         """The folder of the run's objects: in the run, or the last one that the user gave.

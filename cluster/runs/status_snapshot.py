@@ -4,7 +4,6 @@ snapshot = snapshot_of("RUN")        # or a store, or the folder of a learner
 snapshot.stores[0].driver            # the last status of its driver
 """
 
-import json
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from cluster.runs.run_folder import RunFolder
 from cluster.runs.run_log import RunLog
 from learner.settings import METRICS_FILE, PUBLISHED_FILE
 from shared.errors import UsageError
+from shared.io.documents import json_lines
 from shared.plan import Job, covered
 from shared.store import Store
 from shared.store.backends.base import is_url
@@ -193,11 +193,4 @@ def _last_line(file: Path) -> dict[str, Any] | None:
     with file.open("rb") as stream:
         stream.seek(max(file.stat().st_size - MAX_TAIL_BYTES, 0))
         lines = stream.read(MAX_TAIL_BYTES).splitlines()
-    for line in reversed(lines):
-        try:
-            found = json.loads(line)
-        except (ValueError, RecursionError):
-            continue  # Torn, or begun before the tail.
-        if isinstance(found, dict):
-            return found
-    return None
+    return next(json_lines(reversed(lines)), None)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaafford.heatmaps import blended
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.policies.adaptation import Adapter, movable_points
 from shared.policies.policy import Policy
-from shared.records import InteractionRecord, RolloutRecord
 from shared.types import Float32, Interaction, Observation, Role
 
 TOLD = (Role.COLLECT, Role.CONTEXT, Role.CONTEXT_BY_SHARE)

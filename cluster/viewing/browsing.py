@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from itertools import groupby
 from typing import Any
 
-from shared.records import RolloutRecord
+from shared.plan import RolloutRecord
 from shared.store import Store
 from shared.store.coverage import Part
 from shared.types import OutcomeKind

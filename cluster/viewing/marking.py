@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from adaafford.scans import Scan, npz_of
 from shared.errors import UsageError
-from shared.io.files import create_exclusively, write_atomically
+from shared.io.files import create_exclusively, write_atomically, writing
 from shared.observation import estimated_normals
 from shared.types import Float
 
@@ -150,13 +150,11 @@ class Marking:
         """
         marked = self.marked()
         data = npz_of(marked)
-        try:
+        with writing(path, "name another place by --out"):
             if overwrite:
                 write_atomically(path, data)
             elif not create_exclusively(path, data):
                 raise UsageError(f"{path}: is there already; start again with another --out, or with --overwrite")
-        except OSError as error:
-            raise UsageError(f"{path}: cannot be written ({error.strerror}); name another place by --out") from None
         assert marked.movable is not None
         return int(marked.movable.sum())
 

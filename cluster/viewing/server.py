@@ -94,11 +94,7 @@ def small(value: str) -> str:
 
 
 class Page:
-    """What all pages have in common: one callback at a time, errors as a line, actions as arrows.
-
-    Args:
-        server: that shows it.
-    """
+    """What all pages have in common: one callback at a time, errors as a line, actions as arrows."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.server = server
@@ -173,14 +169,7 @@ class Page:
     def arrows(
         self, name: str, actions: Sequence[Action], colours: Sequence[tuple[int, int, int]], size: float
     ) -> None:
-        """Draw actions as arrows along their approach, with the head where the hand touches.
-
-        Args:
-            name: of the scene's node.
-            actions: any number.
-            colours: of each.
-            size: length of the arrows, m.
-        """
+        """Draw actions as arrows along their approach, with the head where the hand touches."""
         ends = [[action.point - size * action.approach, action.point] for action in actions]
         self.vectors(name, np.array(ends).reshape(-1, 2, 3), np.array(colours).reshape(-1, 3), size)
 

@@ -15,8 +15,8 @@ from shared.errors import AdaAffordError
 from shared.extras import require
 from shared.geometry import quaternion_from_rotation
 from shared.io.text import plain
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.policies.policy import Policy
-from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
 from shared.types import Float, Interaction, Observation, OutcomeKind
 

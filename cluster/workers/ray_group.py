@@ -354,9 +354,6 @@ def _require_own_node() -> None:
     """Check that the Ray node of this process is alive; in a session of our own it is the only node.
 
     Ray notices its death only after a quarter of a minute, and then ends this process without a message.
-
-    Raises:
-        WorkerError: the node is dead.
     """
     own = ray.get_runtime_context().get_node_id()
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]

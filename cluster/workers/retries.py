@@ -34,11 +34,7 @@ logger = logging.getLogger(__name__)
 
 
 class JobError(WorkerError):
-    """A job failed too often, and none of its rollouts is the cause.
-
-    Attributes:
-        job: the job.
-    """
+    """A job failed too often, and none of its rollouts is the cause."""
 
     def __init__(self, job: Job, message: str) -> None:
         super().__init__(message)

@@ -19,12 +19,7 @@ _LENGTH, _LIMIT = struct.Struct("<Q"), struct.Struct("<d")
 
 
 class ChildProcess:
-    """Answers one question after another; is started by the first, and again by the next after it has ended.
-
-    Args:
-        module: what it runs.
-        most_bytes: of an answer.
-    """
+    """Answers one question after another; is started by the first, and again by the next after it has ended."""
 
     def __init__(self, module: str, most_bytes: int) -> None:
         self._module = module

@@ -23,7 +23,7 @@ from collector.objects.writing import (
     write_folder,
 )
 from collector.sim.engine import cooked
-from shared.errors import UsageError
+from shared.io.files import writing
 from shared.types import Float
 
 Format = Literal["urdf", "mjcf"]
@@ -67,11 +67,9 @@ def export_object(target: ArticulatedObject, format: Format, folder: Path, part_
         files[URDF_FILE] = _text(urdf)
     else:
         files[MAIN_FILES[format]] = _text(_mjcf(target.ref.id, model, inertials, files))
-    try:
+    with writing(folder, "name a folder that can"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         write_folder(folder, files)
-    except OSError as error:
-        raise UsageError(f"{folder}: cannot be written ({error.strerror}); name a folder that can") from None
     return folder / MAIN_FILES[format]
 
 

@@ -115,12 +115,6 @@ class UrdfBodies:
     """Merges the links of a URDF into bodies: those that fixed joints tie together become one.
 
     A body without collision meshes collides as it looks.
-
-    Args:
-        urdf: the tree.
-        found: its meshes, loaded.
-        names: semantic name by link.
-        where: what messages call the object.
     """
 
     def __init__(self, urdf: Urdf, found: UrdfMeshes, names: Mapping[str, str], where: str) -> None:

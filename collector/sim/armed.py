@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from collector.objects.surface import surface_at
+from collector.objects.articulation import surface_at
 from collector.sim.simulator import PrivilegedState, SimEnvironment
 from collector.stopwatch import StageClock
 from shared.arms.arm import Arm

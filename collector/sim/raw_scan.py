@@ -12,7 +12,7 @@ from collector.sim.environment import draw_state
 from collector.sim.surroundings import draw_surroundings, extent
 from shared.config import CameraConfig
 from shared.geometry import camera_pose
-from shared.segmentation.kinds import Kind
+from shared.segmentation.scenes import Kind
 from shared.types import Float
 
 

@@ -6,8 +6,8 @@ from collector.objects.articulation import ArticulatedObject
 from collector.sim.scene import Scene
 from shared.config import SAPIEN, CollectionConfig
 from shared.errors import UsageError
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.primitives import PRIMITIVES
-from shared.records import InteractionRecord, RolloutRecord
 from shared.types import Direction, Float, OutcomeKind
 
 

@@ -12,8 +12,8 @@ from collector.sim.scene import Scene
 from collector.sim.trial import Trial
 from shared.config import CollectionConfig, Fidelity
 from shared.geometry import camera_pose
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.primitives import PRIMITIVES
-from shared.records import InteractionRecord, RolloutRecord
 from shared.types import Action, Float, Outcome
 
 

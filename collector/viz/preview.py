@@ -15,32 +15,27 @@ from collector.sim.camera import DepthImage, EmbreeCamera
 from shared.config import CameraConfig
 from shared.errors import UsageError
 from shared.geometry import camera_pose
-from shared.io.files import write_atomically
+from shared.io.files import write_atomically, writing
 from shared.types import Float
 
 BODY_COLOUR = (0.62, 0.62, 0.62)
 PALM_COLOUR, FINGER_COLOUR = (0.2, 0.2, 0.25), (1.0, 0.8, 0.0)
 AMBIENT = 0.5
 """Share of a colour that shows where no light falls."""
+AZIMUTH_DEG = 205.0
+"""Of the camera; objects face 180."""
 LIGHT_FROM = (-0.6, 0.45, 0.66)
 """Unit direction towards the light, world."""
 
 
 def contact_sheet(
-    objects: Sequence[ArticulatedObject],
-    out_png: Path,
-    openness: float = 0.5,
-    azimuth_deg: float = 205.0,
-    image_size: int = 240,
-    titles: Sequence[str] = (),
+    objects: Sequence[ArticulatedObject], out_png: Path, image_size: int = 240, titles: Sequence[str] = ()
 ) -> None:
     """Write a grid of pictures, id and category below each: the body grey, every movable part coloured.
 
     Args:
         objects: in reading order.
         out_png: file to write.
-        openness: position of every joint between its lower limit (0) and its upper limit (1).
-        azimuth_deg: of the camera; objects face 180.
         image_size: pixels along an edge of one picture.
         titles: what is below each picture instead.
 
@@ -58,7 +53,7 @@ def contact_sheet(
         axes.set_axis_off()
     texts = titles or [f"{target.ref.id}\n{target.ref.category}" for target in objects]
     for axes, target, text in zip(grid, objects, texts, strict=False):
-        axes.imshow(picture(target, openness, azimuth_deg, image_size))
+        axes.imshow(picture(target, image_size))
         axes.set_title(text, fontsize=7, y=-0.12)
     figure.subplots_adjust(left=0.0, right=1.0, bottom=0.04, top=1.0, wspace=0.02, hspace=0.16)
     save(figure, out_png)
@@ -72,19 +67,16 @@ def save(figure: Figure, out_png: Path) -> None:
     """
     image = BytesIO()
     figure.savefig(image, format="png")
-    try:
+    with writing(out_png, "name a .png file that can"):
         out_png.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out_png, image.getvalue())
-    except OSError as error:
-        raise UsageError(f"{out_png}: cannot be written ({error.strerror}); name a .png file that can") from None
 
 
-def picture(target: ArticulatedObject, openness: float, azimuth_deg: float, size: int) -> Float:
-    """One object, [size, size, 3], colours in [0, 1], on white."""
-    config, limits = CameraConfig(image_size=size), target.limits()
-    positions = limits[:, 0] + openness * (limits[:, 1] - limits[:, 0])
-    camera = EmbreeCamera(target, camera_pose(azimuth_deg, 30.0, config.distance), config)
-    return shaded(camera.capture(positions), part_colours(len(target.parts)), size)
+def picture(target: ArticulatedObject, size: int) -> Float:
+    """One object, every joint half open, [size, size, 3], colours in [0, 1], on white."""
+    config = CameraConfig(image_size=size)
+    camera = EmbreeCamera(target, camera_pose(AZIMUTH_DEG, 30.0, config.distance), config)
+    return shaded(camera.capture(target.limits().mean(axis=1)), part_colours(len(target.parts)), size)
 
 
 def shaded(image: DepthImage, colours: Float, size: int) -> Float:

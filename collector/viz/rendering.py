@@ -54,10 +54,6 @@ class Renderer:
     """Draws the frames of a playback from one place.
 
     What does not move is drawn once; each frame adds the bodies that do, and their shadows.
-
-    Args:
-        playback: what is drawn.
-        view: from where, and how large.
     """
 
     def __init__(self, playback: Playback, view: View) -> None:

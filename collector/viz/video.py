@@ -13,9 +13,9 @@ from collector.viz.playback import Playback
 from collector.viz.rendering import Picture, Renderer, View, fitted, with_most_of_the_hand
 from shared.errors import UsageError
 from shared.extras import require_packages
-from shared.io.files import write_atomically
+from shared.io.files import write_atomically, writing
 from shared.io.text import plain
-from shared.records import InteractionRecord, RolloutRecord
+from shared.plan import InteractionRecord, RolloutRecord
 
 SUFFIXES = (".mp4", ".gif", ".png")
 FRAMES_A_SECOND = 25
@@ -139,11 +139,9 @@ def write_video(clips: Sequence[Clip], out: Path, advance: Callable[[], None] = 
     else:
         write = _write_mp4 if out.suffix.lower() == ".mp4" else _write_gif
         write(counted(picture for clip in clips for picture in clip.pictures(range(len(clip)))), file)
-    try:
+    with writing(out, "name a file that can"):
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, file.getvalue())
-    except OSError as error:
-        raise UsageError(f"{out}: cannot be written ({error.strerror}); name a file that can") from None
 
 
 def _write_mp4(pictures: Iterator[Picture], file: io.BytesIO) -> None:

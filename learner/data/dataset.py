@@ -61,7 +61,7 @@ class Rows:
         continued: [I], whether the row began where the one before it left the object.
         facts: [I, facts], for the oracle only (see `learner.data.privileged`).
         valid: [I], whether the primitive ran to its end (see `shared.types.OutcomeKind.is_valid`).
-        role, method: [I], names (see `shared.records.InteractionRecord`).
+        role, method: [I], names (see `shared.plan.InteractionRecord`).
         budget: [I].
     """
 

@@ -158,6 +158,6 @@ def spread(numbers: Sequence[int], most: int) -> list[int]:
     return [numbers[place] for place in np.linspace(0, len(numbers) - 1, min(most, len(numbers))).astype(int)]
 
 
-def draw_numbers(count: int, size: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """`size` numbers below `count`, each once where there are enough."""
-    return rng.choice(count, size, replace=size > count)
+def draw(numbers: Sequence[int], most: int, rng: np.random.Generator) -> list[int]:
+    """At most `most` of the numbers at random, each once."""
+    return [numbers[place] for place in rng.choice(len(numbers), min(most, len(numbers)), replace=False)]

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from learner.evaluation.bootstrap import f_score_interval, ratio_interval
 from learner.evaluation.curve import Answers, Asked, CriticKind
-from learner.metrics import THRESHOLD, cross_entropies, discrimination
+from learner.metrics import THRESHOLD, cross_entropies, discrimination, f_score_interval, ratio_interval
 
 _PRIOR, _NO_TRIES, _ORACLE = Asked("where2act", 0), Asked("random", 0), Asked("oracle", 0)
 

@@ -6,9 +6,8 @@ What does not depend on the interactions is computed once for all rows. Shapes: 
 import torch
 from torch import Tensor
 
-from learner.data.cached_features import FrozenAap, FrozenPrior
 from learner.data.dataset import Dataset
-from learner.data.features import FrozenFeatures
+from learner.data.features import FrozenAap, FrozenFeatures, FrozenPrior
 from learner.stages.oracle import OracleCritic, Teacher
 from learner.stages.trainers import RowCritic, training_of
 from shared.policies.methods import CriticName

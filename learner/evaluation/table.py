@@ -15,10 +15,9 @@ from torch import Tensor
 
 from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import FrozenFeatures
-from learner.evaluation.bootstrap import ratio_interval
 from learner.evaluation.critics import OracleScores, row_critic
 from learner.evaluation.published_mix import mix_for, shifted_threshold
-from learner.metrics import THRESHOLD, discrimination
+from learner.metrics import THRESHOLD, discrimination, ratio_interval
 from learner.stages.oracle import OracleCritic
 from learner.stages.trainers import RowCritic
 from shared.errors import StoreError
@@ -116,6 +115,8 @@ class ObjectCounts:
 class EvaluationRow:
     """One method after one budget of interactions, on all rollouts together; NaN where there was nothing to measure.
 
+    Names that end in `_low` and `_high` are the limits of the figure's 95% interval over objects.
+
     Attributes:
         task: what was evaluated.
         method: whose interactions.
@@ -130,21 +131,9 @@ class EvaluationRow:
         start_success: share of the EXPLOIT_AT_START rows that succeeded.
         trials: how many EXPLOIT rows.
         mean_tries: interactions made a rollout, which stopping may leave below the budget.
-        f_score_low: where its 95% interval over objects begins.
-        f_score_high: where it ends.
-        sample_success_low: where its 95% interval over objects begins.
-        sample_success_high: where it ends.
-        start_success_low: where its 95% interval over objects begins.
-        start_success_high: where it ends.
         mix_f_score: as `f_score`, on the published mix of rows (see `learner.evaluation.published_mix`).
-        mix_f_score_low: where its 95% interval over objects begins.
-        mix_f_score_high: where it ends.
         shifted_f_score: the same after logits are shifted by logit(`mix_base_rate`) - logit(`base_rate`).
-        shifted_f_score_low: where its 95% interval over objects begins.
-        shifted_f_score_high: where it ends.
         share_success: share of the EXPLOIT_BY_SHARE rows that succeeded.
-        share_success_low: where its 95% interval over objects begins.
-        share_success_high: where it ends.
         mix_base_rate: share of successes in the published mix of rows.
         counts: what these are of, by object.
     """
@@ -185,12 +174,6 @@ def evaluate_store(
     store: Store, version: int, budgets: Sequence[int], oracle: OracleCritic | None = None
 ) -> list[EvaluationRow]:
     """Evaluate a policy version on an evaluation store that holds it, and what its methods did with others.
-
-    Args:
-        store: the evaluation store.
-        version: which policy.
-        budgets: numbers of interactions.
-        oracle: to judge beside it.
 
     Raises:
         StoreError: the store is damaged, holds no QUERY row, or lacks a policy that a method used.

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from learner.data.augmentation import draw_flips, draw_turns, flip_frames
 from learner.data.dataset import Dataset, Split
 from learner.data.features import FrozenFeatures
-from learner.data.sampling import Batch, OrderedRows, draw_numbers, order_rows, spread
+from learner.data.sampling import Batch, OrderedRows, draw, order_rows, spread
 from learner.metrics import discrimination, discrimination_in_chunks
 from learner.settings import AapConfig
 from learner.stages.oracle import OracleCritic, Teacher
@@ -137,9 +137,8 @@ class AapStage:
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The losses on a few rollouts."""
-        config, train = self.config, self.parts.train
-        chosen = draw_numbers(len(train), min(config.batch_rollouts, len(train)), rng)
-        rollouts = [train[number] for number in chosen]
+        config = self.config
+        rollouts = draw(self.parts.train, config.batch_rollouts, rng)
         ordered = order_rows(self.dataset, rollouts, config.rows_per_rollout, rng, config.continued_first)
         context = ordered.longest_context(config.context)
         turns = draw_turns(len(rollouts), config.augmentation, rng)
@@ -217,9 +216,8 @@ class OracleStage:
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The critic's loss on a few rollouts."""
-        train = self.parts.train
-        chosen = draw_numbers(len(train), min(self.config.oracle_batch_rollouts, len(train)), rng)
-        ordered = order_rows(self.dataset, [train[k] for k in chosen], self.config.rows_per_rollout, rng)
+        chosen = draw(self.parts.train, self.config.oracle_batch_rollouts, rng)
+        ordered = order_rows(self.dataset, chosen, self.config.rows_per_rollout, rng)
         turns = draw_turns(len(chosen), self.config.augmentation, rng)
         flips = draw_flips(len(chosen), self.config.augmentation, rng)
         mine = share(len(chosen))

@@ -16,10 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from learner.data.cached_features import FrozenAap
 from learner.data.dataset import Dataset, Split
-from learner.data.features import ProposalPool
-from learner.data.sampling import OrderedRows, draw_numbers, order_rows
+from learner.data.features import FrozenAap, ProposalPool
+from learner.data.sampling import OrderedRows, draw, order_rows
 from learner.metrics import rank_correlation
 from learner.settings import AffordanceConfig
 from learner.training.data_parallel import share
@@ -146,7 +145,7 @@ class AffordanceStage:
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The loss on some of the questions."""
-        drawn = draw_numbers(self.config.questions, min(self.config.points, self.config.questions), rng)
+        drawn = draw(range(self.config.questions), self.config.points, rng)
         asked = self._train.select(torch.as_tensor(drawn[share(len(drawn))]))
         return StepResult({"affordance": self._loss(self.critic.predict(*asked.told), asked.target)}, len(drawn))
 

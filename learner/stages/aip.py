@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from learner.data.cached_features import FrozenAap
 from learner.data.dataset import Dataset, Split
-from learner.data.sampling import OrderedRows, draw_numbers, order_rows, spread
+from learner.data.features import FrozenAap
+from learner.data.sampling import OrderedRows, draw, order_rows, spread
 from learner.metrics import correlation
 from learner.settings import AipConfig
 from learner.stages.oracle import Teacher
@@ -81,9 +81,7 @@ class AipStage:
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The critic's loss on a few rollouts, several ordered subsets of each."""
-        train = self.parts.train
-        chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
-        ordered = self._order([train[number] for number in chosen], rng)
+        ordered = self._order(draw(self.parts.train, self.config.batch_rollouts, rng), rng)
         total, ordered = int(ordered.valid.sum()), ordered.select(share(len(ordered.rows)))
         found = self.gains(ordered)
         predicted = self._predict(ordered, found)

@@ -36,7 +36,7 @@ from learner.training.loop import CHECKPOINT_FILE, TrainingResult
 from shared.errors import UsageError
 from shared.formatting import finite
 from shared.io.documents import read_document
-from shared.io.files import exclusive_lock, read_bounded, write_atomically
+from shared.io.files import exclusive_lock, make_folder, read_bounded, write_atomically
 from shared.networks.network_config import NetworkConfig
 from shared.policies.methods import BASELINES, ModuleName
 from shared.policies.policy import (
@@ -47,7 +47,7 @@ from shared.policies.policy import (
     Policy,
 )
 from shared.seeds import generator, torch_seed
-from shared.store.snapshot import Snapshot
+from shared.store.coverage import Snapshot
 from shared.store.store import Store
 
 DONE_FILE = "done.json"
@@ -157,10 +157,7 @@ def run_stage(
         _check_done(job.out / DONE_FILE, fingerprint)
         _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
         return read_policy_folder(job.out)
-    try:
-        job.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"--out {job.out}: cannot be made ({error.strerror}); choose another folder") from None
+    make_folder(job.out)
     with exclusive_lock(job.out / LOCK_FILE) if data_parallel.rank() == 0 else nullcontext():
         _train(job, config, store, policy, oracle, fingerprint, hardware or Hardware(), memory or Memory())
     _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")

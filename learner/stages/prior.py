@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from learner.data.augmentation import draw_flips, draw_turns, flip_frames, turn_frames, turn_vectors
 from learner.data.dataset import Dataset, Split
 from learner.data.features import frozen_features
-from learner.data.sampling import draw_numbers, spread
+from learner.data.sampling import draw, spread
 from learner.metrics import discrimination
 from learner.settings import PriorConfig
 from learner.training.data_parallel import share
@@ -48,7 +48,7 @@ class PriorStage:
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """Both losses on the rows of a few clouds."""
-        chosen = np.sort(draw_numbers(len(self._rows_of_cloud), self._batch(), rng))
+        chosen = sorted(draw(range(len(self._rows_of_cloud)), self.config.batch_clouds, rng))
         most = self.config.actions_per_cloud
         picked = [rng.permutation(self._rows_of_cloud[number])[:most] for number in chosen]
         turns = draw_turns(len(chosen), self.config.augmentation, rng)
@@ -78,9 +78,6 @@ class PriorStage:
             "base_rate": found.base_rate,
             "proposal": float(losses["proposal"]),
         }
-
-    def _batch(self) -> int:
-        return min(self.config.batch_clouds, len(self._rows_of_cloud))
 
     def _noise(self, rows: NDArray[np.int64], rng: np.random.Generator) -> Tensor:
         """What the proposals at each success among the rows are drawn from, [successes, S, noise_width]."""

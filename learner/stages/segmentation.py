@@ -17,8 +17,7 @@ from shared.io.files import make_folder, write_atomically
 from shared.networks.grouping import group_cloud
 from shared.networks.pointnet2 import CloudBatch
 from shared.networks.segmentation import SEGMENTATION_NETWORK, SegmentationNetwork
-from shared.segmentation.kinds import MOVABLE, Kind
-from shared.segmentation.scenes import Scene, read_scene, read_scenes_document, scene_path
+from shared.segmentation.scenes import MOVABLE, Kind, Scene, read_scene, read_scenes_document, scene_path
 from shared.segmentation.segmenter import Segmenter, begun
 
 VALIDATION_SHARE = 8

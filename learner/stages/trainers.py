@@ -11,9 +11,8 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from learner.data.cached_features import FrozenAap
 from learner.data.dataset import Dataset, Split
-from learner.data.features import FrozenFeatures, ProposalPool
+from learner.data.features import FrozenAap, FrozenFeatures, ProposalPool
 from learner.settings import AffordanceConfig, LearnerConfig, LearnerSettings, TrainingConfig
 from learner.stages.aap import AapStage, OracleStage
 from learner.stages.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic, RowOrder

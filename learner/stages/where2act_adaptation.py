@@ -7,10 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from learner.data.cached_features import FrozenPrior
 from learner.data.dataset import Dataset, Split
-from learner.data.features import FrozenFeatures
-from learner.data.sampling import OrderedRows, draw_numbers, order_rows, spread
+from learner.data.features import FrozenFeatures, FrozenPrior
+from learner.data.sampling import OrderedRows, draw, order_rows, spread
 from learner.metrics import discrimination
 from learner.settings import AdaptationConfig
 from learner.stages.trainers import BaselineTraining, Load, StageTrainer
@@ -54,9 +53,8 @@ class AdaptationStage:
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The squared error of corrected scores on a few rollouts."""
-        train = self.parts.train
-        chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
-        ordered = order_rows(self.dataset, [train[number] for number in chosen], self.config.rows_per_rollout, rng)
+        chosen = draw(self.parts.train, self.config.batch_rollouts, rng)
+        ordered = order_rows(self.dataset, chosen, self.config.rows_per_rollout, rng)
         total, ordered = int(ordered.valid.sum()), ordered.select(share(len(chosen)))
         return StepResult({"correction": self._loss(ordered)}, total)
 

@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from learner.data.augmentation import draw_flips, draw_turns
-from learner.data.cached_features import FrozenAap, FrozenPrior
 from learner.data.dataset import Dataset, Split
-from learner.data.features import FrozenFeatures
-from learner.data.sampling import Batch, OrderedRows, draw_numbers, padded, spread
+from learner.data.features import FrozenAap, FrozenFeatures, FrozenPrior
+from learner.data.sampling import Batch, OrderedRows, draw, padded, spread
 from learner.evaluation.critics import AdaptiveScores
 from learner.metrics import discrimination_in_chunks
 from learner.settings import InteractionConfig
@@ -72,9 +71,8 @@ class InteractionStage:
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The critic's loss on a few rollouts."""
-        train = self.parts.train
-        chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
-        ordered = self.order([train[number] for number in chosen], self.config.rows_per_rollout, rng)
+        chosen = draw(self.parts.train, self.config.batch_rollouts, rng)
+        ordered = self.order(chosen, self.config.rows_per_rollout, rng)
         turns = draw_turns(len(chosen), self.config.augmentation, rng)
         flips = draw_flips(len(chosen), self.config.augmentation, rng)
         mine = share(len(chosen))

@@ -26,6 +26,7 @@ from learner.training.hardware import Hardware
 from learner.training.trackers import Trackers
 from shared.errors import UsageError
 from shared.formatting import finite
+from shared.io.documents import json_lines
 from shared.io.files import read_bounded
 from shared.progress import Progress, minutes
 from shared.seeds import generator
@@ -281,8 +282,12 @@ class _Loop:
         if not path.exists():
             return
         lines = read_bounded(path, MAX_METRICS_BYTES).decode(errors="replace").splitlines()
-        kept = [line for line in map(_parsed, lines) if line is not None]
-        text = "".join(json.dumps(line) + "\n" for line in kept if line["step"] <= step)
+        kept = [
+            line
+            for line in json_lines(lines)
+            if isinstance(at := line.setdefault("step", 0), int | float) and at <= step
+        ]
+        text = "".join(json.dumps(line) + "\n" for line in kept)
         temporary = path.with_suffix(".tmp")
         temporary.write_text(text, encoding="utf-8")
         temporary.replace(path)
@@ -296,14 +301,6 @@ def rate_factor(config: TrainingConfig, step: int) -> float:
     if done < WARMING:
         return done / WARMING
     return 0.5 * (1.0 + math.cos(math.pi * (done - WARMING) / (1.0 - WARMING)))
-
-
-def _parsed(line: str) -> dict[str, Any] | None:
-    try:
-        parsed = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    return parsed if isinstance(parsed, dict) and isinstance(parsed.setdefault("step", 0), int | float) else None
 
 
 def _print_line(line: str) -> None:

@@ -1,7 +1,12 @@
-"""JSON from files that nobody vouches for: bounded in size, depth and number of values before any of it is believed."""
+"""JSON from files that nobody vouches for: bounded in size, depth and number of values before any of it is believed.
+
+Documents of a store carry their own checksum, so that a flipped bit anywhere in them is found.
+"""
 
 import codecs
+import hashlib
 import json
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -71,6 +76,17 @@ def read_document(model: type[Model], path: Path, limit: int, remedy: str) -> Mo
     return parse_document(model, read_bounded(path, limit), str(path), remedy)
 
 
+def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
+    """The JSON objects among some lines; one that a kill tore, or that is something else, is left out."""
+    for line in lines:
+        try:
+            found = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(found, dict):
+            yield found
+
+
 def problem_of(error: ValidationError) -> str:
     """The first thing that is wrong with a document, in a line of bounded length."""
     if error.error_count() > MAX_PROBLEMS:
@@ -93,3 +109,76 @@ def named_twice(pairs: list[tuple[str, Any]]) -> str | None:
 def _refuse_twins(pairs: list[tuple[str, Any]]) -> None:
     if (name := named_twice(pairs)) is not None:
         raise ValueError(f"'{plain(name, MAX_WORD)}' occurs twice")
+
+
+_MAX_VALUE = 60
+
+
+def difference_of(stored: dict[str, Any], given: dict[str, Any]) -> str:
+    """The first setting that differs, with both values, and how many more do."""
+    found = [f"{name}: the store has {ours}, given {theirs}" for name, ours, theirs in differences(stored, given)]
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    return (found[0] if found else "they are equal") + more
+
+
+def differences(before: Any, after: Any, name: str = "") -> Iterator[tuple[str, str, str]]:
+    """Every setting that differs between two documents of `name`: its name, and both values, shortened."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in dict.fromkeys([*before, *after]):
+            yield from differences(before.get(key), after.get(key), f"{name}.{key}" if name else key)
+    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        for k, (old, new) in enumerate(zip(before, after, strict=True)):
+            yield from differences(old, new, f"{name}[{k}]")
+    elif isinstance(before, list) and isinstance(after, list):
+        yield name, f"{len(before)} entries", str(len(after))
+    elif before != after:
+        yield name, _brief(before), _brief(after)
+
+
+def _brief(value: Any) -> str:
+    text = "nothing" if value is None else str(value)
+    return text if len(text) <= _MAX_VALUE else f"{text[:_MAX_VALUE]}..."
+
+
+_SEAL = "sha256"
+
+
+def canonical(content: Any) -> bytes:
+    """The one way in which the store writes a JSON value: sorted keys, no NaN, two blanks of indentation."""
+    return json.dumps(content, sort_keys=True, indent=2, allow_nan=False, ensure_ascii=True).encode() + b"\n"
+
+
+def with_checksum(content: dict[str, Any]) -> bytes:
+    """The document's bytes, with the checksum of its content added."""
+    return canonical(content | {_SEAL: _checksum(content)})
+
+
+def without_checksum(data: bytes, source: str) -> dict[str, Any]:
+    """The content of a document that `with_checksum` wrote.
+
+    Raises:
+        StoreError: it is not JSON, not an object, or not what was sealed, byte for byte.
+    """
+    return checked_content(parse_object(data, source), data, source)
+
+
+def checked_content(content: dict[str, Any], data: bytes, source: str) -> dict[str, Any]:
+    """The same of a document that is parsed already.
+
+    Raises:
+        StoreError: it is not what was sealed, byte for byte.
+    """
+    checksum = content.pop(_SEAL, None)
+    if checksum != _checksum(content) or with_checksum(content) != data:
+        raise StoreError(f"{source}: its checksum does not match; the file is damaged: restore it from a copy")
+    return content
+
+
+def has_checksum(content: dict[str, Any]) -> bool:
+    """Whether an object carries the checksum of the rest of it."""
+    return content.get(_SEAL) == _checksum({name: value for name, value in content.items() if name != _SEAL})
+
+
+def _checksum(content: dict[str, Any]) -> str:
+    # Without indentation, since only then does Python's fast encoder run.
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

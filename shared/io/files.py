@@ -83,6 +83,19 @@ def make_folder(path: Path) -> None:
         raise UsageError(f"{path}: no folder can be made of this name ({error.strerror}); name another") from None
 
 
+@contextmanager
+def writing(path: Path, advice: str = "name another place") -> Iterator[None]:
+    """Write what a user named.
+
+    Raises:
+        UsageError: the system refuses; the message ends with the advice.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written ({error.strerror}); {advice}") from None
+
+
 def sync_file(path: Path) -> None:
     """Force a file that others wrote to the disk."""
     descriptor = os.open(path, os.O_RDONLY)

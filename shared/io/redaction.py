@@ -3,8 +3,8 @@
     without_secrets("http://me:word@host/")        # "http://***@host/"
     without_places("/home/me/runs/a/store", ...)   # "store", where "/home/me/runs/a" is the run
 
-Every message goes through the first one (`cluster.cli.main`, `cluster.runs.logs`), every text that a run keeps through
-both.
+Every message goes through the first one (`cluster.cli.main`, `cluster.runs.streams`), every text that a run keeps
+through both.
 """
 
 import os

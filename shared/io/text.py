@@ -28,10 +28,10 @@ def plain(text: object, most: int | None = None) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in shown)[:most]
 
 
-def short(text: object, length: int = 80) -> str:
+def short(text: object) -> str:
     """`text` for a one-line message: quoted, without control characters, shortened."""
-    quoted = repr(str(text)[: length + 1])
-    return quoted if len(quoted) <= length + 2 else quoted[:length] + "...'"
+    quoted = repr(str(text)[: MAX_WORD + 1])
+    return quoted if len(quoted) <= MAX_WORD + 2 else quoted[:MAX_WORD] + "...'"
 
 
 def markdown(text: object) -> str:

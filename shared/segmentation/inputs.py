@@ -1,5 +1,7 @@
 """What the segmentation network is given of a raw scan: what is left without floor and walls, thinned and described.
 
+Floor and walls are large planes with nothing behind them (RANSAC).
+
 The frame of the network has z up and x away from the camera; its origin is on the floor, in the middle of what is left.
 Shapes: M points of a scan, N points that the network is given.
 """
@@ -13,8 +15,107 @@ from scipy.spatial import cKDTree
 from shared import seeds
 from shared.errors import UsageError
 from shared.observation import furthest_first
-from shared.segmentation.planes import floor_and_walls
 from shared.types import Float, Float32
+
+TOLERANCE_M = 0.015
+"""What is so near a plane is on it; a depth camera errs by some millimetres."""
+HYPOTHESES, SAMPLE = 600, 2500
+"""Planes through three random points, and the random points on which they are judged."""
+MOST_TILT = 0.17
+"""A floor is level and a wall upright within asin of this, 10 deg."""
+BEHIND = 0.06
+"""The largest share of the points behind a floor or wall: what is seen over a wall, and what was measured wrongly."""
+LEAST_SHARE = 0.04
+"""The smallest share of the points on a floor or wall."""
+LEAST_WIDTH = 0.5
+"""A wall is at least as wide as this share of the scan, floor included; fronts of objects are narrower."""
+MOST_WALLS = 2
+CONSIDERED = 20
+"""The hypotheses with the most points, of which the first that is wide enough is the wall."""
+
+
+def floor_and_walls(points: Float, camera: Float, rng: np.random.Generator) -> tuple[NDArray[np.bool_], float]:
+    """Which points are on, below or behind the floor and the walls.
+
+    Args:
+        points: [M, 3], z up.
+        camera: [3], in the same frame.
+        rng: draws hypotheses.
+
+    Returns:
+        [M], whether a point belongs to the floor or to a wall; and the height of the floor below the other points, or
+        the lowest height where there is no floor.
+    """
+    left = np.ones(len(points), dtype=bool)
+    floor = _plane(points, points, camera, rng, upright=False)
+    if floor is None:
+        return ~left, float(points[:, 2].min())
+    normal, offset = floor
+    left &= points @ normal - offset > TOLERANCE_M
+    if not left.any():
+        return ~left, offset
+    for _ in range(MOST_WALLS):
+        wall = _plane(points[left], points, camera, rng, upright=True)
+        if wall is None:
+            break
+        behind = points @ wall[0] - wall[1] <= TOLERANCE_M
+        if (left & behind).sum() == left.sum():
+            break
+        left &= ~behind
+    middle = np.median(points[left], axis=0)
+    return ~left, float((offset - normal[:2] @ middle[:2]) / normal[2])
+
+
+def _plane(
+    points: Float, scan: Float, camera: Float, rng: np.random.Generator, *, upright: bool
+) -> tuple[Float, float] | None:
+    """The floor of a scan, or a wall: its normal, [3], towards the camera, and its offset; None where there is none."""
+    if len(points) < 3:
+        return None
+    sample = points[rng.integers(len(points), size=min(SAMPLE, len(points)))]
+    corners = sample[rng.integers(len(sample), size=(HYPOTHESES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals /= lengths[:, None]
+        steep = np.abs(normals[:, 2])
+        fits = (lengths > 1e-6) & ((steep < MOST_TILT) if upright else (steep > np.sqrt(1 - MOST_TILT**2)))
+    normals, corners = normals[fits], corners[fits, 0]
+    normals *= np.sign((normals * (camera - corners)).sum(axis=1, keepdims=True))
+    heights = sample @ normals.T - (normals * corners).sum(axis=1)
+    on, behind = (np.abs(heights) <= TOLERANCE_M).mean(axis=0), (heights < -2 * TOLERANCE_M).mean(axis=0)
+    on = np.where((behind <= BEHIND) & (on >= LEAST_SHARE), on, 0.0)
+    best = None
+    for number in np.argsort(-on)[: CONSIDERED if upright else 1]:
+        if on[number] > 0 and (not upright or _is_wide(normals[number], heights[:, number], sample, scan, rng)):
+            best = int(number)
+            break
+    if best is None:
+        return None
+    normal, corner = normals[best], corners[best]
+    for _ in range(2):
+        near = points[np.abs((points - corner) @ normal) <= TOLERANCE_M]
+        corner = near.mean(axis=0)
+        fitted: Float = np.linalg.eigh(np.cov((near - corner).T))[1][:, 0]
+        normal = fitted * np.sign(fitted @ normal)
+    return normal, float(normal @ corner)
+
+
+def _is_wide(normal: Float, heights: Float, sample: Float, scan: Float, rng: np.random.Generator) -> bool:
+    """Whether an upright plane is as wide as a wall.
+
+    Args:
+        normal: [3], of the plane.
+        heights: [S], of the sample's points above it.
+        sample: [S, 3].
+        scan: [M, 3].
+        rng: draws the points of the scan that say how wide it is.
+    """
+    along = np.array([-normal[1], normal[0]])
+    room = scan[rng.integers(len(scan), size=SAMPLE), :2] @ along
+    width = np.ptp(np.percentile(sample[np.abs(heights) <= TOLERANCE_M, :2] @ along, [1, 99]))
+    return bool(width >= LEAST_WIDTH * np.ptp(np.percentile(room, [1, 99])))
+
 
 POINTS, CANDIDATES = 3072, 30_000
 """Points of a scan that the network is given, and random ones among which they are chosen."""

@@ -5,6 +5,7 @@ scene-000000.safetensors      one scan as the network is given it, with labels; 
 """
 
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -21,6 +22,23 @@ from shared.io.files import read_bounded, write_atomically
 from shared.policies.policy import read_tensors
 from shared.segmentation.inputs import EXTRA, POINTS
 from shared.types import Float32
+
+
+class Kind(IntEnum):
+    """The classes of the segmentation network."""
+
+    BACKGROUND = 0
+    """Floor, walls and other things."""
+    BODY = 1
+    """The static body of the object."""
+    TURNING = 2
+    """A part that turns: a door, a lid, a switch."""
+    SLIDING = 3
+    """A part that slides: a drawer, a button."""
+
+
+MOVABLE = (Kind.TURNING, Kind.SLIDING)
+
 
 SCENES_FILE = "scenes.json"
 MAX_SCENES = 100_000

@@ -27,7 +27,7 @@ from shared.networks.pointnet2 import CloudBatch
 from shared.networks.segmentation import SEGMENTATION_NETWORK, SegmentationNetwork
 from shared.policies.policy import MAX_WEIGHTS_BYTES, WEIGHTS_FILE, read_tensors
 from shared.segmentation.inputs import EXTRA, SegmentationInput, network_input
-from shared.segmentation.kinds import MOVABLE, Kind
+from shared.segmentation.scenes import MOVABLE, Kind
 from shared.types import Float, Float32
 
 SEGMENTATION_FILE = "segmentation.json"
@@ -86,11 +86,7 @@ class Segmentation:
 
 
 class Segmenter:
-    """Segments raw scans.
-
-    Args:
-        network: trained.
-    """
+    """Segments raw scans."""
 
     def __init__(self, network: SegmentationNetwork) -> None:
         self._network = network

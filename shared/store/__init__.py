@@ -3,12 +3,11 @@
 from shared.store.backends.conformance import check_place
 from shared.store.codecs.observations import ObservationArrays
 from shared.store.layout import SCHEMA_VERSION, FileEntry, Quarantined, ShardManifest
-from shared.store.maintenance.compaction import Compaction, compact
+from shared.store.maintenance.compaction import Compaction, compact, reopen_quarantined
 from shared.store.maintenance.export import Export, export
 from shared.store.maintenance.info import StoreInfo, SuccessCount, info
 from shared.store.maintenance.merging import Merged, merge
 from shared.store.maintenance.migration import Migrated, migrate
-from shared.store.maintenance.reopening import reopen_quarantined
 from shared.store.maintenance.repair import Repair, repair
 from shared.store.maintenance.verify import Problem, verify
 from shared.store.store import Store

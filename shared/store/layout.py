@@ -17,17 +17,36 @@ Names that begin with ".tmp-" are work in progress or its remnants; names that b
 """
 
 import re
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from shared.config import MAX_DEPTH_SIZE, StrictModel
 from shared.errors import SchemaVersionError, StoreError
-from shared.io.documents import MAX_VALUES, parse_object, problem_of
+from shared.io.documents import MAX_VALUES, checked_content, has_checksum, parse_object, problem_of
 from shared.plan import Job, Setting
-from shared.store.codecs.checksummed import checked_content, has_checksum
+
+STORE, OBJECTS = "STORE", "OBJECTS"
+"""What stands for the store and the objects in a command that is kept, since both may move."""
+
+
+def reproduction(store: Path | str, shard_id: str, objects: Path | str, rollout: int | None = None) -> str:
+    """The command, as a shell takes it.
+
+    Args:
+        store: folder of the store.
+        shard_id: the job's shard.
+        objects: folder of the objects.
+        rollout: number of the rollout within the plan; None for the whole job.
+    """
+    words = ["adaafford", "store", "replay", str(store), shard_id, "--objects", str(objects)]
+    return shlex.join(words if rollout is None else [*words, "--rollout", str(rollout)])
+
 
 SCHEMA_VERSION = 1
 """docs/compatibility.md says what the number promises and when it is increased."""
@@ -89,6 +108,11 @@ class FileEntry(StrictModel):
 
     size: int = Field(ge=0)
     sha256: str = Field(pattern=_SHA256)
+
+
+def file_entries(files: Mapping[str, bytes]) -> dict[str, FileEntry]:
+    """What some files are, by name."""
+    return {name: FileEntry(size=len(data), sha256=sha256(data).hexdigest()) for name, data in files.items()}
 
 
 class Quarantined(StrictModel):

@@ -6,9 +6,16 @@ from collections.abc import Collection, Mapping
 
 from shared.config import StrictModel
 from shared.errors import StoreError
+from shared.io.documents import with_checksum
 from shared.store.backends.base import Folder, StorageBackend, Transaction
-from shared.store.codecs.checksummed import with_checksum
-from shared.store.layout import MAX_DOCUMENT_BYTES, POLICIES_FOLDER, SCHEMA_VERSION, FileEntry, parse_sealed
+from shared.store.layout import (
+    MAX_DOCUMENT_BYTES,
+    POLICIES_FOLDER,
+    SCHEMA_VERSION,
+    FileEntry,
+    file_entries,
+    parse_sealed,
+)
 
 INDEX_FILE = "index.json"
 MAX_POLICY_BYTES = (1 << 28) + (1 << 20)
@@ -52,11 +59,7 @@ def publish_policy(backend: StorageBackend, version: int, files: Mapping[str, by
 
 
 def _index(version: int, files: Mapping[str, bytes]) -> bytes:
-    return with_checksum(PolicyIndex(version=version, files=_entries(files)).as_document())
-
-
-def _entries(files: Mapping[str, bytes]) -> dict[str, FileEntry]:
-    return {n: FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) for n, data in files.items()}
+    return with_checksum(PolicyIndex(version=version, files=file_entries(files)).as_document())
 
 
 def read_policy(backend: StorageBackend, version: int) -> dict[str, bytes]:
@@ -78,15 +81,10 @@ def read_policy(backend: StorageBackend, version: int) -> dict[str, bytes]:
 def version_of(backend: StorageBackend, files: Mapping[str, bytes], besides: Collection[int] = ()) -> int | None:
     """The first version that was published with exactly these files; None if there is none.
 
-    Args:
-        backend: of the store.
-        files: of the policy.
-        besides: versions to ignore.
-
     Raises:
         StoreError: an index is damaged.
     """
-    entries = _entries(files)
+    entries = file_entries(files)
     alike = (v for v in policy_versions(backend) if v not in besides and _read_index(backend, v).files == entries)
     return next(alike, None)
 

@@ -10,8 +10,7 @@ import numpy as np
 from pydantic_core import from_json
 
 from shared.errors import StoreError
-from shared.plan import Job, ObjectRef
-from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
+from shared.plan import InteractionRecord, Job, ObjectRef, RolloutRecord, RolloutStatus
 from shared.store.backends.base import Folder, StorageBackend
 from shared.store.codecs import observations
 from shared.store.codecs.columns import INTERACTION_COLUMNS, MAX_TEXT, ROLLOUT_COLUMNS, added_in, hidden_names

@@ -79,11 +79,7 @@ class Selection:
 
 
 def _tested(condition: Condition) -> str:
-    """The column that a condition names.
-
-    Raises:
-        UsageError: it is no condition.
-    """
+    """The column that a condition names."""
     if not isinstance(condition, tuple) or len(condition) != 3 or condition[1] not in OPERATORS:
         raise UsageError(
             f"where: {str(condition)[:80]} is no condition; give tuples of column, operator and value, such as "

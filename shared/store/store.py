@@ -16,18 +16,16 @@ from typing import Any
 import pyarrow as pa
 
 from shared.errors import StoreError, UnreadableError, UsageError
+from shared.io.documents import difference_of, with_checksum
 from shared.io.files import TEMPORARY_PREFIX
-from shared.plan import Job, Plan, Setting
-from shared.records import RolloutRecord
+from shared.plan import Job, Plan, RolloutRecord, Setting
 from shared.store import policies, reader
 from shared.store.backends.base import Folder, StorageBackend, backend_of, is_url
 from shared.store.backends.conformance import check_place
 from shared.store.clouds import observations_of, stacked
-from shared.store.codecs.checksummed import with_checksum
 from shared.store.codecs.columns import interaction_columns, rollout_columns
-from shared.store.codecs.digest import combined_digest
 from shared.store.codecs.observations import ObservationArrays
-from shared.store.coverage import Part, parts_of
+from shared.store.coverage import Part, Snapshot, parts_of
 from shared.store.crash_log import CRASH_LOG_FOLDER, CrashLog
 from shared.store.layout import (
     INTERACTIONS_FILE,
@@ -45,12 +43,10 @@ from shared.store.layout import (
     parse_shard_id,
     parse_store_document,
 )
-from shared.store.maintenance.difference import difference_of
 from shared.store.presence import DRIVER
 from shared.store.provenance import store_software
 from shared.store.selection import Condition, Selection
-from shared.store.snapshot import Snapshot
-from shared.store.writer import commit_shard
+from shared.store.writer import combined_digest, commit_shard
 from shared.types import Observation
 
 MAX_SEED = 2**64 - 1
@@ -304,9 +300,9 @@ class Store:
         folders = ["", PLANS_FOLDER, SHARDS_FOLDER, POLICIES_FOLDER]
         return self.backend.sweep(folders) + self.crash_log.sweep()
 
-    def digest(self, plan_key: str | None = None) -> str:
-        """Content digest of the store, or of one plan: independent of shards, workers, hosts and times."""
-        parts = self.parts(plan_key)
+    def digest(self) -> str:
+        """Content digest of the store: independent of shards, workers, hosts and times."""
+        parts = self.parts()
         manifests = reader.read_manifests(self.backend, (part.shard for part in parts))
         return combined_digest(
             (manifest.plan_key, index, manifest.digests[index - manifest.start])
@@ -314,18 +310,12 @@ class Store:
             for index in range(part.start, part.stop)
         )
 
-    def interactions(
-        self,
-        columns: Sequence[str] | None = None,
-        plan_keys: Sequence[str] | None = None,
-        where: Sequence[Condition] = (),
-    ) -> Any:
+    def interactions(self, columns: Sequence[str] | None = None, where: Sequence[Condition] = ()) -> Any:
         """A pyarrow table, one row an interaction; "shard" and "observation" (index in it) find a row's cloud.
 
         Args:
             columns: names (see `shared.store.codecs.columns`); None: all. "shard" and "observation" always come. A
                 hidden parameter that the store lacks has its default in every row, if its package is installed.
-            plan_keys: rows of these plans only; None: all.
             where: rows that meet all of these conditions only, such as ("outcome", "=", "ok"). Rows of one shard at a
                 time are in memory beside the result.
 
@@ -333,7 +323,7 @@ class Store:
             UsageError: there is no such column, or a condition is none.
             StoreError: a file is damaged or foreign.
         """
-        return self._table(INTERACTIONS_FILE, self.select(columns, where), plan_keys)
+        return self._table(INTERACTIONS_FILE, self.select(columns, where))
 
     def rollouts(self, columns: Sequence[str] | None = None, where: Sequence[Condition] = ()) -> Any:
         """A pyarrow table, one row a rollout, including those without interactions; "shard" is the name of its shard.
@@ -357,11 +347,11 @@ class Store:
             names.append("observation")
         return Selection.of("interactions", known, names, where)
 
-    def _table(self, file: str, selection: Selection, plan_keys: Sequence[str] | None = None) -> Any:
+    def _table(self, file: str, selection: Selection) -> Any:
         """What is selected from one of the two tables of all shards, and which shard each row is of."""
         tables = [_with_shard(selection.schema.empty_table(), "")]
         few: list[Any] = []
-        for table in self._selected(file, selection, self._parts_of(plan_keys)):
+        for table in self._selected(file, selection, self.parts()):
             few.append(table)
             if len(few) == _TABLES_AT_ONCE:
                 # Copied together: a column of one shard takes far more memory than its numbers.
@@ -369,14 +359,9 @@ class Store:
                 few.clear()
         return pa.concat_tables([*tables, *few])
 
-    def each(
-        self, file: str, names: Sequence[str] | None = None, plan_keys: Sequence[str] | None = None
-    ) -> Iterator[tuple[Part, ShardManifest, Any]]:
+    def each(self, file: str, names: Sequence[str] | None = None) -> Iterator[tuple[Part, ShardManifest, Any]]:
         """What counts of each shard, its manifest, and one of its tables (see `reader.read_tables`), in order."""
-        return reader.read_tables(self.backend, self._parts_of(plan_keys), file, names)
-
-    def _parts_of(self, plan_keys: Sequence[str] | None) -> Iterable[Part]:
-        return (part for part in self.parts() if plan_keys is None or part.shard.plan_key in plan_keys)
+        return reader.read_tables(self.backend, self.parts(), file, names)
 
     def selected(self, selection: Selection, parts: Iterable[Part]) -> Iterator[Any]:
         """What `select` chose of the interactions of some shards, a table each; raises as `interactions` does."""

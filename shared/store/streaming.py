@@ -25,10 +25,9 @@ from shared.store.clouds import check_fields
 from shared.store.codecs.columns import LIST, interaction_columns
 from shared.store.codecs.observations import ObservationArrays
 from shared.store.codecs.tables import column_values
-from shared.store.coverage import Part
+from shared.store.coverage import Part, Snapshot
 from shared.store.layout import INTERACTIONS_FILE
 from shared.store.selection import Condition
-from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
 COLUMNS = ("object_id", "point_index", "point", "rotation", "motion", "success")

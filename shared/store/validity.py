@@ -7,8 +7,7 @@ import numpy as np
 
 from shared.errors import StoreError
 from shared.hidden import ALWAYS_DRAWN
-from shared.plan import Job
-from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
+from shared.plan import InteractionRecord, Job, RolloutRecord, RolloutStatus
 from shared.store.codecs.columns import MAX_TEXT
 from shared.store.codecs.observations import check_observation, depth_size
 from shared.store.layout import MAX_ALL_PIXELS, MAX_ALL_POINTS, MAX_ROWS, Quarantined

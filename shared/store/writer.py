@@ -1,38 +1,101 @@
-"""Commit of shards: all files of a shard, with its manifest last; the storage backend makes this atomic."""
+"""Commit of shards: all files of a shard, with its manifest last; the storage backend makes this atomic.
+
+The content digest is over the data without times, hosts, versions or shards. Same plan, same seed, same policy: same
+digest, whether one worker made the rollouts or a thousand.
+"""
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
 
 from shared.errors import StoreError
+from shared.io.documents import with_checksum
 from shared.io.redaction import without_places
-from shared.plan import Job
-from shared.records import RolloutRecord
-from shared.reproduction import OBJECTS, STORE, reproduction
+from shared.plan import Job, RolloutRecord, RolloutStatus
 from shared.store.backends.base import Folder, StorageBackend, Transaction
 from shared.store.codecs import observations
-from shared.store.codecs.checksummed import with_checksum
-from shared.store.codecs.columns import InteractionRow, RolloutRow, interaction_columns, rollout_columns
-from shared.store.codecs.digest import rollout_digest
+from shared.store.codecs.columns import (
+    INTERACTION_COLUMNS,
+    Column,
+    InteractionRow,
+    RolloutRow,
+    interaction_columns,
+    rollout_columns,
+)
+from shared.store.codecs.observations import Packed, pack
 from shared.store.codecs.tables import table_bytes
+from shared.store.coverage import Part
 from shared.store.layout import (
     INTERACTIONS_FILE,
     MANIFEST_FILE,
     MAX_ROWS,
+    OBJECTS,
     OBSERVATIONS_FOLDER,
     ROLLOUTS_FILE,
     SHARDS_FOLDER,
-    FileEntry,
+    STORE,
     Quarantined,
     ShardManifest,
+    file_entries,
     parse_manifest,
     parse_shard_id,
+    reproduction,
     schema_version,
 )
 from shared.store.provenance import process_provenance, store_software
-from shared.store.reader import is_committed, read_files, read_manifest, read_rollouts, shard_folder
+from shared.store.reader import is_committed, read_files, read_manifest, read_rollouts, shard_folder, unknown_of
 from shared.store.validity import check_quarantined, check_rollouts
+
+Row = TypeVar("Row")
+
+
+def rollout_digest(rollout: RolloutRecord, clouds: Sequence[Packed] | None = None) -> str:
+    """SHA-256 of one rollout, over the canonical little-endian bytes of its columns and clouds.
+
+    Args:
+        rollout: the rollout.
+        clouds: its observations as `observations.pack` makes them, where somebody has them.
+    """
+    digest = hashlib.sha256()
+    if rollout.status is RolloutStatus.NEVER_AT_REST:
+        # Earlier software did not tell the two apart; the same plan shall have the digest that it had.
+        rollout = replace(rollout, status=RolloutStatus.NOTHING_TO_ACT_ON)
+    _add_columns(digest, rollout_columns(rollout.dynamics.added), [RolloutRow(rollout, 0)])
+    if rollout.arm_base:
+        # Not every store has it, and those without keep their digests.
+        _add(digest, "arm_base", [len(rollout.arm_base)], np.array(rollout.arm_base, "<f8").tobytes())
+    rows = [InteractionRow(rollout, interaction, 0) for interaction in rollout.interactions]
+    _add_columns(digest, INTERACTION_COLUMNS, rows)
+    for cloud in map(pack, rollout.observations) if clouds is None else clouds:
+        for name, packed in cloud.items():
+            _add(digest, name, packed.shape, packed.tobytes())
+    return digest.hexdigest()
+
+
+def combined_digest(digests: Iterable[tuple[str, int, str]]) -> str:
+    """SHA-256 of many rollouts, given as plan key, number within the plan and digest, in this order."""
+    digest = hashlib.sha256()
+    for plan_key, index, one in digests:
+        digest.update(f"{plan_key} {index} {one}\n".encode())
+    return digest.hexdigest()
+
+
+def _add_columns(digest: Any, columns: Sequence[Column[Row]], rows: Sequence[Row]) -> None:
+    for column in columns:
+        if column.content:
+            cells = column.gather(rows)
+            # Lengths and texts are framed as JSON, so that no two columns of cells give the same bytes.
+            frame = (len(rows), cells.lengths, cells.texts)
+            _add(digest, column.name, frame, np.ascontiguousarray(cells.numbers).tobytes())
+
+
+def _add(digest: Any, name: str, frame: Sequence[Any], data: bytes) -> None:
+    digest.update(json.dumps([name, frame, len(data)], separators=(",", ":")).encode())
+    digest.update(data)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +155,7 @@ def commit_shard(
         observations=sum(len(rollout.observations) for rollout in rollouts),
         points=points,
         depth_size=pixels,
-        files=_entries(files),
+        files=file_entries(files),
         digests=tuple(map(rollout_digest, rollouts, clouds)),
         software=store_software(),
         provenance=process_provenance() | {name: str(value) for name, value in provenance.items()},
@@ -101,6 +164,31 @@ def commit_shard(
     described = manifest.as_document() | dict(unknown.fields)
     _publish(backend, parse_manifest(with_checksum(described), str(shard)), files, vetted=vetted)
     return read_manifest(shard)
+
+
+def commit_part(backend: StorageBackend, source: Folder, manifest: ShardManifest, part: Part, note: str) -> None:
+    """Commit some of a shard's rollouts as a shard of their own, in the same store or in another.
+
+    Args:
+        backend: of the store that gets them.
+        source: the shard.
+        manifest: of the source.
+        part: which rollouts.
+        note: what the provenance calls the shard that they are from.
+
+    Raises:
+        StoreError: the source is damaged.
+    """
+    commit_shard(
+        backend,
+        part.job,
+        read_rollouts(source, manifest)[part.start - manifest.start : part.stop - manifest.start],
+        manifest.points,
+        manifest.provenance | {note: manifest.shard_id},
+        [each for each in manifest.quarantined if part.start <= each.rollout < part.stop],
+        vetted=True,
+        unknown=Unknown({file: part.of(table) for file, table in unknown_of(source, manifest).items()}, manifest.more),
+    )
 
 
 def copy_shard(source: Folder, manifest: ShardManifest, backend: StorageBackend) -> None:
@@ -126,7 +214,7 @@ def commit_files(backend: StorageBackend, manifest: ShardManifest, files: Mappin
     Raises:
         StoreError: the committed files cannot be read, or their rollouts do not match the manifest.
     """
-    whole = manifest.model_copy(update={"files": _entries(files)})
+    whole = manifest.model_copy(update={"files": file_entries(files)})
     _publish(backend, whole, files, vetted=True)
     _check_digests(shard_folder(backend, whole.shard_id), whole)
 
@@ -147,7 +235,7 @@ def _publish(backend: StorageBackend, manifest: ShardManifest, files: Mapping[st
     def describe(held: Mapping[str, bytes]) -> bytes:
         described = manifest
         if held != files:
-            described = manifest.model_copy(update={"files": _entries(held)})
+            described = manifest.model_copy(update={"files": file_entries(held)})
             _check_taken_over(shard, described)
         return with_checksum(described.as_document())
 
@@ -189,10 +277,6 @@ def _encode(
         INTERACTIONS_FILE: table_bytes(interaction_columns(added), interaction_rows, unknown.get(INTERACTIONS_FILE)),
         **{f"{OBSERVATIONS_FOLDER}/{name}": data for name, data in group.items()},
     }
-
-
-def _entries(files: Mapping[str, bytes]) -> dict[str, FileEntry]:
-    return {n: FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) for n, data in files.items()}
 
 
 def _check_taken_over(shard: Folder, manifest: ShardManifest) -> None:

@@ -8,10 +8,10 @@ import pytest
 from adaafford.parts import SEGMENTATION, bundled_segmenter, read_segmenter
 from adaafford.pretrained import PRETRAINED_FOLDER
 from collector.objects.catalogue import load, scan
-from collector.objects.procedural.writing import generate
+from collector.objects.procedural.catalogue import generate
 from collector.sim.raw_scan import random_scan
 from shared.seeds import generator
-from shared.segmentation.kinds import Kind
+from shared.segmentation.scenes import Kind
 from shared.segmentation.segmenter import Segmenter
 
 

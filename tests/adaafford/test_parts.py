@@ -14,7 +14,7 @@ from adaafford.sessions import Session, SessionFiles, parts_file
 from cluster.cli.main import run as adaafford
 from shared.errors import StoreError, UsageError
 from shared.policies.policy import CORE, WEIGHTS_FILE, Policy
-from shared.segmentation.kinds import Kind
+from shared.segmentation.scenes import Kind
 from shared.segmentation.segmenter import (
     SEGMENTATION_FILE,
     Part,

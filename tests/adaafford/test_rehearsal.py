@@ -15,7 +15,7 @@ from cluster.cli.library import simulated
 from cluster.cli.main import run as adaafford
 from cluster.evaluation import rehearsal
 from cluster.evaluation.rehearsal import STATE, Executed, Setting, SimulatedRobot
-from collector.objects.procedural.writing import generate
+from collector.objects.procedural.catalogue import generate
 from collector.sim.depth_noise import LEVEL_M, noisy
 from collector.sim.environment import camera_for
 from shared.config import CameraConfig

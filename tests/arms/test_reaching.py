@@ -16,9 +16,9 @@ from cluster.evaluation.rehearsal import Setting as Rehearsal
 from cluster.evaluation.rehearsal import SimulatedRobot
 from cluster.evaluation.resimulation import chosen_interactions, resimulate
 from collector.domain_randomisation import draw_arm_base
+from collector.objects.articulation import SURFACE_POINTS, surface_at
 from collector.objects.catalogue import load_ref, scan
-from collector.objects.procedural.writing import generate
-from collector.objects.surface import POINTS, surface_at
+from collector.objects.procedural.catalogue import generate
 from collector.setting import make_setting
 from collector.sim.armed import ArmedEnvironment
 from collector.sim.restoration import restored
@@ -36,10 +36,10 @@ from shared.policies.proposers import proposer_named
 from shared.primitives import PRIMITIVES
 from shared.store import Store
 from shared.store.codecs.columns import ROLLOUT_COLUMNS, RolloutRow
-from shared.store.codecs.digest import rollout_digest
 from shared.store.codecs.tables import read_table, table_bytes
 from shared.store.layout import ARM_VERSION
 from shared.store.validity import check_rollouts
+from shared.store.writer import rollout_digest
 from shared.tasks import task_named
 from shared.types import Action, HiddenDynamics, Observation, OutcomeKind
 from tests.adaafford.test_adapt_command import front
@@ -151,7 +151,7 @@ def test_the_base_of_a_rollout_stands_before_the_object_and_faces_it() -> None:
     assert bases == [draw_arm_base(plan, index, door()) for index in range(30)]
     assert len(set(bases)) == 30
     surface = surface_at(door(), door().limits()[:, 0])
-    assert len(surface) == POINTS
+    assert len(surface) == SURFACE_POINTS
     for x, y, z, yaw in bases:
         assert x < surface[:, 0].min() and z == surface[:, 2].min()
         assert abs(np.arctan2(-y, -x) - yaw) < 0.25

@@ -16,8 +16,7 @@ from benchmarks.script import run_script
 from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import random_storage_furniture
 from collector.objects.writing import write_object
-from shared.plan import Job, Plan
-from shared.records import InteractionRecord, RolloutRecord
+from shared.plan import InteractionRecord, Job, Plan, RolloutRecord
 from shared.seeds import generator
 from shared.types import Float32, Interaction, Observation, Outcome, OutcomeKind
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cluster.cli.main import COMMANDS, run
-from shared.categories import TEST_CATEGORIES
+from shared.tasks import TEST_CATEGORIES
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *args: str) -> str:
@@ -113,6 +113,23 @@ def test_objects_are_made_of_a_group_of_categories(tmp_path: Path) -> None:
     assert run(["objects", "generate", str(tmp_path), "--per-category", "1", "--categories", "test", "Box"]) == 0
     made = {folder.name.removesuffix("-0000") for folder in tmp_path.iterdir()}
     assert made == {name.lower() for name in (*TEST_CATEGORIES, "Box")}
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["objects", "generate", "DIR", "--per-category", "0"],
+        ["objects", "export", "DIR", "--out", "DIR", "--part-mass", "0"],
+        ["train", "segmentation", "--scenes", "DIR", "--out", "DIR", "--seed", "-1"],
+    ],
+)
+def test_a_flag_out_of_bounds_is_refused_in_one_line(
+    args: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = complaint(capsys, *(str(tmp_path) if word == "DIR" else word for word in args))
+    assert args[-2].strip("-").replace("-", "_") in line
+    assert "Input should be greater than" in line
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,8 +11,8 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from cluster.cli import main
-from cluster.config.worker_settings import RayAddress
-from cluster.runs.logs import JsonLines, Lines
+from cluster.config.command_settings import RayAddress
+from cluster.runs.streams import JsonLines, Lines
 from shared.errors import UsageError
 from shared.io.redaction import without_places, without_secrets
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cluster.cli.main import COMMANDS
-from collector.objects.procedural.writing import generate
+from collector.objects.procedural.catalogue import generate
 from shared.plan import Job, Plan
 from shared.policies.policy import Policy
 from shared.store import Store

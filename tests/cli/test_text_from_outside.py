@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.cli.main import run as adaafford
-from cluster.runs.logs import JsonLines, Lines
+from cluster.runs.streams import JsonLines, Lines
 from shared.formatting import csv_table
 from shared.io.text import csv_cell, markdown, plain
 

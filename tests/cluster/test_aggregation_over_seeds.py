@@ -22,7 +22,7 @@ from cluster.reporting.aggregation import (
     write_comparison,
 )
 from cluster.runs.run_folder import ObjectsUsed, begin
-from learner.evaluation.bootstrap import ratio_interval
+from learner.metrics import ratio_interval
 from shared.config import CollectionConfig
 from shared.errors import UsageError
 from shared.plan import EvaluationConfig, ObjectRef, Setting

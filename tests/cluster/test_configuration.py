@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from cluster.cli.main import run
 from cluster.config.campaign_config import EXECUTION_SETTINGS, CampaignConfig, RolloutCounts
-from cluster.config.evaluation_settings import EvaluateSettings
+from cluster.config.command_settings import EvaluateSettings
 from cluster.config.flags import early_flags, layered, parse_flags, preset_names
 from cluster.runs.run_folder import begin, find
 from shared.errors import UsageError
-from shared.store.maintenance.difference import differences
+from shared.io.documents import differences
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,18 +14,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.cli.main import run as adaafford
-from cluster.config.evaluation_settings import EvaluateSettings
+from cluster.config.command_settings import EvaluateSettings
 from cluster.evaluation.evaluate import PROPOSER, Evaluation
 from cluster.evaluation.policy_evaluation import evaluate_policy
 from cluster.evaluation.run_evaluation import evaluate_run, evaluate_without_run
 from cluster.evaluation.tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
 from cluster.workers.retries import JobError
 from cluster.workers.session import CurrentWorkerGroup
-from collector.objects.procedural.writing import generate
+from collector.objects.procedural.catalogue import generate
 from collector.worker import Worker
-from learner.evaluation.bootstrap import ratio_interval
 from learner.evaluation.table import EvaluationRow, ObjectCounts
-from learner.metrics import f_score
+from learner.metrics import f_score, ratio_interval
 from learner.settings import LearnerConfig
 from learner.stages.jobs import CONFIG_FILE, DONE_FILE
 from shared.errors import UsageError

@@ -15,8 +15,7 @@ from cluster.cli.commands.collect import CollectCommand
 from cluster.cli.main import run
 from cluster.collection.driver import LatestPolicy, collect
 from cluster.collection.status_writer import read_status
-from cluster.workers.job_queue import RolloutQueue
-from cluster.workers.policy_source import LOOK_S, PolicySource
+from cluster.workers.job_queue import LOOK_S, PolicySource, RolloutQueue
 from cluster.workers.worker_group import SerialWorkerGroup
 from collector.job_result import JobResult
 from collector.watchdog import UnderWay
@@ -82,7 +81,7 @@ def held(store: Store) -> dict[int, list[int]]:
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """New policies are seen at once, as though shards took long."""
-    monkeypatch.setattr("cluster.workers.policy_source.LOOK_S", 0.0)
+    monkeypatch.setattr("cluster.workers.job_queue.LOOK_S", 0.0)
 
 
 @pytest.mark.usefixtures("at_once")

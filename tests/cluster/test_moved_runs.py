@@ -15,7 +15,7 @@ from cluster.reporting.model_card import PROCEDURAL, source_of_run
 from cluster.runs.run_folder import RunFolder, begin, find
 from cluster.runs.warm_start import seen_by
 from collector.objects.catalogue import scan
-from collector.objects.procedural.writing import generate
+from collector.objects.procedural.catalogue import generate
 from shared.errors import UsageError
 from shared.store import Store
 from shared.store.provenance import changed_versions

@@ -21,11 +21,10 @@ from collector.watchdog import Limits
 from learner.data.dataset import load_dataset
 from shared.errors import StoreError, WorkerError
 from shared.io.files import process_name
-from shared.plan import Job, Plan
-from shared.records import RolloutStatus
+from shared.plan import Job, Plan, RolloutStatus
 from shared.store import Quarantined, Store, compact, verify
 from shared.store.crash_log import CrashLog, Heartbeat, summary_of
-from shared.store.maintenance import reopening
+from shared.store.maintenance import compaction
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
 from tests.support.misbehaving_worker import MisbehavingWorker
 from tests.support.small_networks import TINY
@@ -150,9 +149,9 @@ def test_a_kill_while_shards_are_reopened_loses_and_doubles_nothing(
     fill(disturbed, {5: "raise"})
     fill(undisturbed, {})
     before = disturbed.digest()
-    for step in ("commit_shard", "set_aside"):
+    for step in ("commit_part", "set_aside"):
         with monkeypatch.context() as patch:
-            patch.setattr(reopening, step, lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+            patch.setattr(compaction, step, lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
             with pytest.raises(KeyboardInterrupt):
                 fill(disturbed, {}, retry_quarantined=True)
         assert disturbed.digest() == before

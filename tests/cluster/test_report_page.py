@@ -24,19 +24,18 @@ from cluster.evaluation.trials import EvaluationTrial, first_trials, most_tellin
 from cluster.reporting.clouds import TANGENT, CloudView, draw_panels, tried
 from cluster.reporting.collecting import wilson
 from cluster.reporting.counterfactuals import Counterfactuals, hinge_twins, variations
-from cluster.reporting.failures import FailedExploit, varied
 from cluster.reporting.page import MAX_TEXT, Drawing, Page, Section, plain, render, shortened
 from cluster.reporting.results import Results, like_for_like, table_of
 from cluster.reporting.training import after_tries, curves_of, read_entries
+from cluster.reporting.trial_sections import FailedExploit, varied
 from cluster.runs.run_folder import ObjectsUsed, RunFolder, begin
 from cluster.runs.run_log import RunLog
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import StoreError
-from shared.plan import EvaluationConfig, Job, ObjectRef, Plan, Setting
+from shared.plan import EvaluationConfig, Job, ObjectRef, Plan, RolloutRecord, Setting
 from shared.policies.adaptation import Adapter
 from shared.policies.methods import METHODS
 from shared.policies.policy import Policy
-from shared.records import RolloutRecord
 from shared.store import Store
 from shared.tasks import TASKS, task_named
 from shared.types import OutcomeKind, Role

@@ -14,9 +14,9 @@ from cluster.cli.commands.status import as_json, table
 from cluster.cli.main import run
 from cluster.collection.status_writer import SILENT_S, DriverStatus, State, read_status, status_kept
 from cluster.collection.tally import RECENT_S, CollectionProgress
-from cluster.runs.logs import JsonLines, Lines, configure
 from cluster.runs.run_log import RunLog
 from cluster.runs.status_snapshot import snapshot_of
+from cluster.runs.streams import JsonLines, Lines, configure
 from collector.job_result import JobResult
 from shared.errors import UsageError
 from shared.io.files import host_name, process_name

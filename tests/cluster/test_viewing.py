@@ -13,8 +13,7 @@ from cluster.viewing.browsing import Browser, Filters, choices
 from cluster.viewing.marking import Eye, Marking
 from shared.errors import UsageError
 from shared.io import files
-from shared.plan import Job, Plan
-from shared.records import RolloutRecord
+from shared.plan import Job, Plan, RolloutRecord
 from shared.store.backends.base import is_url
 from shared.types import OutcomeKind, Role
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting, fabricate_store

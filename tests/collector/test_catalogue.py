@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.cli.main import run as adaafford
+from cluster.config.command_settings import ObjectSelection
 from cluster.config.objects import objects_for
-from cluster.config.selection import ObjectSelection
 from collector.objects import procedural
 from collector.objects.catalogue import Catalogue, for_task, load, load_ref, qualifying_parts, read_list, scan, split
 from collector.viz.preview import contact_sheet, part_colours, picture
@@ -384,7 +384,7 @@ def test_a_preview_shows_every_visible_part(shelf: Path, tmp_path: Path) -> None
     contact_sheet(objects, tmp_path / "made/sheet.png", image_size=64)
     assert (tmp_path / "made/sheet.png").read_bytes().startswith(b"\x89PNG")
     colours = part_colours(len(objects[0].parts))
-    pixels = picture(objects[0], 0.5, 205.0, 96).reshape(-1, 3)
+    pixels = picture(objects[0], 96).reshape(-1, 3)
     shades = pixels / np.maximum(pixels.max(axis=1, keepdims=True), 1e-9)
     for colour in colours:
         assert (np.abs(shades - colour / colour.max()).max(axis=1) < 1e-6).any()

@@ -30,9 +30,9 @@ from collector.stopwatch import StageClock
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import UsageError
 from shared.extensions import Registry
+from shared.plan import RolloutRecord
 from shared.policies.adaptation import Adapter
 from shared.policies.proposers import AipProposer
-from shared.records import RolloutRecord
 from shared.tasks import TASKS, task_named
 from shared.types import Action, Observation, Order, Outcome, OutcomeKind
 from tests.support.example_package import install_here

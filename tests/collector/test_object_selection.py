@@ -7,13 +7,12 @@ import pytest
 
 from cluster.cli.main import run
 from cluster.config.campaign_config import CampaignConfig, SplitConfig
+from cluster.config.command_settings import ObjectSelection
 from cluster.config.objects import lists_of, objects_for, split_as_told
-from cluster.config.selection import ObjectSelection
 from collector.objects import procedural
-from shared.categories import TEST_CATEGORIES, TRAIN_CATEGORIES, expanded
 from shared.errors import UsageError
 from shared.plan import ObjectRef
-from shared.tasks import task_named
+from shared.tasks import TEST_CATEGORIES, TRAIN_CATEGORIES, expanded, task_named
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from cluster.cli.main import run as adaafford
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import load, scan
-from collector.objects.procedural.writing import generate
+from collector.objects.procedural.catalogue import generate
 from collector.scenes import make_scenes
 from collector.sim.camera import SURROUNDINGS, EmbreeCamera
 from collector.sim.raw_scan import random_scan, raw_scan
@@ -17,10 +17,8 @@ from shared.config import CameraConfig
 from shared.errors import UsageError
 from shared.geometry import camera_pose
 from shared.seeds import generator
-from shared.segmentation.inputs import POINTS, network_input
-from shared.segmentation.kinds import MOVABLE, Kind
-from shared.segmentation.planes import floor_and_walls
-from shared.segmentation.scenes import read_scene, scene_path
+from shared.segmentation.inputs import POINTS, floor_and_walls, network_input
+from shared.segmentation.scenes import MOVABLE, Kind, read_scene, scene_path
 
 
 @pytest.fixture(scope="module")

@@ -23,10 +23,9 @@ from collector.worker import Worker
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import ObjectError, UsageError
 from shared.geometry import camera_pose
-from shared.plan import EvaluationConfig, Job, Plan, Setting
+from shared.plan import EvaluationConfig, Job, Plan, RolloutRecord, Setting
 from shared.policies.methods import METHODS, method_named
 from shared.primitives import PRIMITIVES
-from shared.records import RolloutRecord
 from shared.store import Store
 from shared.tasks import TASKS, task_named
 from shared.types import Action, Interaction, Observation, Order, Outcome, OutcomeKind, Proposer, Role

@@ -15,7 +15,7 @@ from cluster.cli.commands.collect import CollectCommand
 from cluster.cli.main import run
 from cluster.config.flags import parse_flags
 from cluster.reporting.counterfactuals import variations
-from cluster.reporting.words import hidden
+from cluster.reporting.style import hidden
 from collector.sim.scene import Scene
 from collector.sim.trial import Trial
 from learner.data.dataset import load_dataset

@@ -9,9 +9,8 @@ import pytest
 import torch
 from torch import nn
 
-from learner.data.cached_features import FrozenPrior
 from learner.data.dataset import Dataset, load_dataset
-from learner.data.features import FrozenFeatures
+from learner.data.features import FrozenFeatures, FrozenPrior
 from learner.evaluation.critics import OracleScores, row_critic
 from learner.evaluation.table import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD, evaluate, evaluate_store
 from learner.settings import AdaptationConfig, InteractionConfig, LearnerConfig, TrainingConfig
@@ -24,12 +23,12 @@ from learner.stages.where2act_interaction import InteractionStage
 from learner.training.loop import train
 from shared.errors import StoreError, UsageError
 from shared.networks.aap import Aap
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.policies.adaptation import Adapter
 from shared.policies.critics import critic_named
 from shared.policies.methods import METHODS, BaselineName
 from shared.policies.policy import Policy
 from shared.policies.where2act_interaction import TRIES
-from shared.records import InteractionRecord, RolloutRecord
 from shared.types import Interaction, Role
 from tests.support.small_networks import TINY
 from tests.support.small_policies import BASELINES, CRITICS, policy_with_all

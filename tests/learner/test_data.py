@@ -28,7 +28,7 @@ from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
 from shared.hidden import ALWAYS_DRAWN
 from shared.networks.actions import GRASP_SCALE, middle_of, orthonormal_frames, outcome_details
-from shared.records import RolloutRecord
+from shared.plan import RolloutRecord
 from shared.store.store import Store
 from shared.types import OutcomeKind
 from tests.support.fabricate import fabricate_setting

@@ -12,7 +12,7 @@ from learner.settings import LearnerConfig, TrainingConfig
 from learner.training import data_parallel
 from learner.training.hardware import Hardware, choose_device, hardware, moved
 from learner.training.loop import ParameterGroup, StepResult, train
-from learner.training.tensorboard_tracker import EventFiles
+from learner.training.trackers import EventFiles
 from shared.errors import UsageError
 
 without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -103,7 +103,7 @@ def test_event_files_are_what_tensorboard_reads(tmp_path: Path) -> None:
 
 
 def test_without_tensorboard_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learner.training.tensorboard_tracker.find_spec", lambda name: None)
+    monkeypatch.setattr("learner.training.trackers.find_spec", lambda name: None)
     viewer = EventFiles(tmp_path / "events", 0)
     viewer.add(1, {"line/score": 1.0})
     assert not (tmp_path / "events").exists()

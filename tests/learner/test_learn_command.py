@@ -18,7 +18,7 @@ from shared.errors import StoreError
 from shared.io.files import DRIVER_LOCK, exclusive_lock
 from shared.plan import Job, Plan
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
-from shared.store.snapshot import Snapshot
+from shared.store.coverage import Snapshot
 from shared.store.store import Store
 from tests.support.as_toml import as_toml
 from tests.support.fabricate import fabricate_rollouts
@@ -158,7 +158,7 @@ def test_a_second_learner_in_the_same_folder_is_refused(capsys: pytest.CaptureFi
     assert "is in use by process" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
     assert run(["learn", "--store", "s", "--out", str(tmp_path / "file" / "out"), "--follow"]) == 2
-    assert "cannot be made" in capsys.readouterr().err
+    assert "no folder can be made of this name" in capsys.readouterr().err
 
 
 def test_nothing_to_wait_for_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -15,9 +15,8 @@ from learner.evaluation.published_mix import PULL_MIX, PUSH_MIX, RowMix, mix_for
 from learner.evaluation.table import PRIOR_METHOD, evaluate_store
 from learner.metrics import f_score
 from shared.errors import UsageError
-from shared.plan import Job, Plan
+from shared.plan import InteractionRecord, Job, Plan, RolloutRecord
 from shared.policies.policy import Policy
-from shared.records import InteractionRecord, RolloutRecord
 from shared.store import Store
 from shared.types import OutcomeKind, Role
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting

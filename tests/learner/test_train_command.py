@@ -34,7 +34,7 @@ from shared.io.redaction import without_places
 from shared.plan import Job, Plan
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.progress import Progress
-from shared.store.snapshot import Snapshot
+from shared.store.coverage import Snapshot
 from shared.store.store import Store
 from tests.support.as_toml import as_toml
 from tests.support.small_networks import TINY

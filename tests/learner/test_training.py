@@ -13,13 +13,19 @@ from torch import nn
 
 from cluster.cli.main import run
 from learner.data import features
-from learner.data.cached_features import FrozenAap
 from learner.data.dataset import Dataset, load_dataset
-from learner.data.features import MOST_ENCODERS, FrozenFeatures, ProposalPool, frozen_features
+from learner.data.features import MOST_ENCODERS, FrozenAap, FrozenFeatures, ProposalPool, frozen_features
 from learner.data.sampling import Batch, order_rows
 from learner.evaluation.comparison import curve_rows, rows_of
-from learner.evaluation.curve import Answers, Asked, Candidates, answer, proposal_gains, tries_by_aip
-from learner.evaluation.information import tries_by_information
+from learner.evaluation.curve import (
+    Answers,
+    Asked,
+    Candidates,
+    answer,
+    proposal_gains,
+    tries_by_aip,
+    tries_by_information,
+)
 from learner.evaluation.table import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
 from learner.settings import (
     METRICS_FILE,
@@ -41,8 +47,8 @@ from learner.training.loop import Stage, StepResult, rate_factor, train
 from shared.errors import UsageError
 from shared.networks.actions import outcome_details
 from shared.networks.network_config import NetworkConfig
+from shared.plan import InteractionRecord, RolloutRecord
 from shared.policies.policy import WEIGHTS_FILE, Policy
-from shared.records import InteractionRecord, RolloutRecord
 from shared.types import Role
 from tests.support.small_networks import TINY
 from tests.support.small_trainings import (

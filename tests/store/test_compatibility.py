@@ -18,10 +18,9 @@ from cluster.cli.main import run
 from collector.setting import in_fidelity_of
 from shared.config import CollectionConfig, Fidelity
 from shared.errors import SchemaVersionError, StoreError, UsageError
-from shared.plan import Job, Plan
-from shared.records import RolloutStatus
+from shared.io.documents import with_checksum, without_checksum
+from shared.plan import Job, Plan, RolloutStatus
 from shared.store import Store, compact, export, info, merge, migrate, repair, verify
-from shared.store.codecs.checksummed import with_checksum, without_checksum
 from shared.store.codecs.columns import ROLLOUT_COLUMNS, Column
 from shared.store.codecs.tables import read_table
 from shared.store.layout import Quarantined

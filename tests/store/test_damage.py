@@ -16,11 +16,10 @@ from numcodecs.blosc import Blosc
 
 from learner.data.dataset import load_dataset
 from shared.errors import StoreError
-from shared.io.documents import MAX_VALUES, parse_object
+from shared.io.documents import MAX_VALUES, canonical, parse_object, with_checksum, without_checksum
 from shared.networks.network_config import NetworkConfig
 from shared.plan import Job, Plan
 from shared.store import Store, info, verify
-from shared.store.codecs.checksummed import canonical, with_checksum, without_checksum
 from shared.store.codecs.columns import INTERACTION_COLUMNS, MAX_JOINT_NAMES, MAX_TEXT
 from shared.store.codecs.observations import ARRAYS
 from shared.store.codecs.tables import read_table

@@ -21,8 +21,7 @@ import yaml
 from cluster.cli.main import run
 from shared.errors import StoreError, UsageError
 from shared.io.files import exclusive_lock
-from shared.plan import Job, Plan
-from shared.records import InteractionRecord, RolloutRecord
+from shared.plan import InteractionRecord, Job, Plan, RolloutRecord
 from shared.store import Store, export
 from shared.store.maintenance.datacard import SplitFigures, size_category
 from shared.store.maintenance.formats import EXPORT_FORMATS, word

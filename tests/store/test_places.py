@@ -13,8 +13,7 @@ from cluster.cli.main import run
 from learner.data.dataset import load_dataset
 from shared.errors import StoreError, UsageError
 from shared.networks.network_config import NetworkConfig
-from shared.plan import Job, Plan
-from shared.records import RolloutRecord
+from shared.plan import Job, Plan, RolloutRecord
 from shared.store import Store, check_place, info, verify
 from shared.store.backends.base import StorageBackend, Transaction, backend_of
 from shared.store.backends.local import LocalBackend

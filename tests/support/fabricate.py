@@ -17,14 +17,13 @@ import numpy as np
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.depth import DepthMap
 from shared.geometry import camera_pose, gripper_rotation
+from shared.io.documents import with_checksum
 from shared.observation import round_normals, round_points
-from shared.plan import Job, ObjectRef, Plan, Setting
-from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
+from shared.plan import InteractionRecord, Job, ObjectRef, Plan, RolloutRecord, RolloutStatus, Setting
 from shared.store import Store
-from shared.store.codecs.checksummed import with_checksum
 from shared.store.codecs.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, InteractionRow, RolloutRow
-from shared.store.codecs.digest import rollout_digest
 from shared.store.codecs.tables import table_bytes
+from shared.store.writer import rollout_digest
 from shared.types import (
     Action,
     Direction,

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numcodecs.blosc import Blosc
 
-from shared.store.codecs.checksummed import with_checksum
+from shared.io.documents import with_checksum
 from tests.support.mutations import damaged, pick
 
 T = TypeVar("T")

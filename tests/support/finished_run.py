@@ -9,7 +9,7 @@ from pathlib import Path
 from cluster.config.campaign_config import CampaignConfig
 from cluster.runs.run_folder import ObjectsUsed, RunFolder, begin
 from collector.objects.catalogue import scan
-from collector.objects.procedural.writing import generate
+from collector.objects.procedural.catalogue import generate
 from shared.networks.network_config import NetworkConfig
 from shared.plan import Setting
 from shared.policies.policy import Policy

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from collector.stopwatch import StageClock
 from collector.worker import Worker
-from shared.plan import Plan
-from shared.records import RolloutRecord
+from shared.plan import Plan, RolloutRecord
 from tests.support.fabricate import fabricate_rollout
 
 

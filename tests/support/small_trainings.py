@@ -15,8 +15,7 @@ from learner.settings import (
     PriorConfig,
 )
 from learner.training.loop import Stage, StepResult
-from shared.plan import Job, Plan
-from shared.records import RolloutRecord
+from shared.plan import Job, Plan, RolloutRecord
 from shared.store.store import Store
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 from tests.support.small_networks import TINY

@@ -15,8 +15,7 @@ import pyarrow as pa
 import zarr.codecs
 import zarr.storage  # noqa: F401 - once, and not in each child.
 
-from shared.plan import Job, Plan
-from shared.records import RolloutRecord
+from shared.plan import Job, Plan, RolloutRecord
 from shared.store import Store
 from shared.store.backends.base import is_url
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting

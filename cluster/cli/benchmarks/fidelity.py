@@ -3,7 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -87,24 +87,9 @@ class FidelityResult:
 
     def as_json(self) -> dict[str, Any]:
         """What `--json` prints."""
-        return {
-            "trials": self.trials,
-            "objects": self.objects,
-            "positives": self.positives,
-            "candidate_positives": self.candidate_positives,
-            "label_agreement": self.label_agreement,
-            "positive_f1": self.positive_f1,
-            "kind_agreement": self.kind_agreement,
-            "near_threshold": self.near_threshold,
-            "near_threshold_other_labels": self.near_threshold_other_labels,
-            "clear_label_agreement": self.clear_label_agreement,
-            "clear_positive_f1": self.clear_positive_f1,
-            "motion_error_median": self.motion_error_median,
-            "motion_error_p95": self.motion_error_p95,
-            "reference_ms": self.reference_ms,
-            "fast_ms": self.candidate_ms,
-            "confusions": dict(self.confusions),
-        }
+        told = asdict(self) | {"fast_ms": self.candidate_ms, "confusions": dict(self.confusions)}
+        del told["candidate_ms"]
+        return told
 
 
 def compare(

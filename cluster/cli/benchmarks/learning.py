@@ -8,9 +8,8 @@ from typing import Any
 
 import torch
 
-from learner.data.cached_features import FrozenAap
 from learner.data.dataset import Dataset, Split, load_dataset, split
-from learner.data.features import FrozenFeatures
+from learner.data.features import FrozenAap, FrozenFeatures
 from learner.settings import LearnerConfig, TrainingConfig
 from learner.stages.aap import AapStage, OracleStage
 from learner.stages.aip import AipStage

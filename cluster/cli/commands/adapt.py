@@ -5,7 +5,9 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Annotated, BinaryIO
+
+from pydantic import Field
 
 from cluster.config.flags import parse_flags
 from shared.errors import AdaAffordError, UsageError
@@ -70,7 +72,7 @@ class AdaptCommand:
     """The most interactions that are proposed before the final action."""
     points: int = 2048
     """How many points of a scan the policy receives: as many as in its training (see its model card)."""
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0)] = 0
     """Of the random draws."""
     arm: str | None = None
     """The arm that executes the actions: panda, ur5e, FILE.urdf, or FILE.urdf#LINK where LINK carries the hand. Only
@@ -98,8 +100,6 @@ def main(args: list[str]) -> int:
         raise UsageError(f"--budget {command.budget}: at least one interaction is needed to adapt")
     if not MIN_SHOWN <= command.points <= MAX_SHOWN:
         raise UsageError(f"--points {command.points}: allowed are {MIN_SHOWN} to {MAX_SHOWN}")
-    if command.seed < 0:
-        raise UsageError(f"--seed {command.seed}: needs a number that is not negative")
     if command.arm is None and any(command.base):
         raise UsageError("--base says where the base of --arm stands; name the arm")
     if not all(abs(number) <= MAX_BASE for number in command.base):

@@ -18,12 +18,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from pydantic import Field
 
+from cluster.config.command_settings import ObjectSelection
 from cluster.config.flags import dispatch
-from cluster.config.selection import ObjectSelection
 from shared.config import FIDELITIES, CollectionConfig, Fidelity
-from shared.errors import UsageError
 from shared.formatting import finite
-from shared.io.files import write_atomically
+from shared.io.files import write_atomically, writing
 from shared.progress import Progress
 
 if TYPE_CHECKING:
@@ -330,11 +329,9 @@ def keep(result: dict[str, Any], folder: Path, name: str) -> Path:
         "software": software_versions(),
         "result": result,
     }
-    try:
+    with writing(path, "name another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(path, (json.dumps(finite(document), indent=2, allow_nan=False) + "\n").encode())
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror}); name another folder") from None
     return path
 
 

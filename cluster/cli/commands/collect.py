@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from pydantic import Field
 
+from cluster.config.command_settings import ObjectSelection, WorkerSettings
 from cluster.config.flags import early_flags, layered, parse_flags
-from cluster.config.selection import ObjectSelection
-from cluster.config.worker_settings import WorkerSettings
 from shared.config import CollectionConfig
 from shared.errors import UsageError
 from shared.plan import ROLLOUTS_PER_SHARD

@@ -162,7 +162,7 @@ def _answers(
     gains: bool,
 ) -> "tuple[Answers, list[ProposalGain]]":
     """A run's answers and, if wanted, how much its proposals tell."""
-    from learner.data.cached_features import FrozenAap
+    from learner.data.features import FrozenAap
     from learner.evaluation.curve import answer, proposal_gains
     from learner.stages.oracle import read_oracle
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from cluster.config.evaluation_settings import EvaluateSettings
+from cluster.config.command_settings import EvaluateSettings
 from cluster.config.flags import parse_flags
 from shared.errors import UsageError
 from shared.policies.methods import method_named

@@ -42,19 +42,14 @@ def _learn(command: LearnCommand) -> None:
     from learner.rounds import Following, Pace, publish
     from learner.training import data_parallel
     from learner.training.hardware import hardware
-    from shared.io.files import DRIVER_LOCK, exclusive_lock
+    from shared.io.files import DRIVER_LOCK, exclusive_lock, make_folder
     from shared.store.store import Store
 
     job = command.job()
     with ExitStack() as stack:
         used = stack.enter_context(hardware(command.settings))
         if data_parallel.rank() == 0:
-            try:
-                command.out.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise UsageError(
-                    f"--out {command.out}: cannot be made ({error.strerror}); choose another folder"
-                ) from None
+            make_folder(command.out)
             stack.enter_context(exclusive_lock(command.out / DRIVER_LOCK))
         if command.follow:
             pace = Pace(command.first_rollouts, command.more_rollouts, command.poll_s)

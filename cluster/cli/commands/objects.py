@@ -153,9 +153,8 @@ class ScenesCommand:
 
 
 def _generate(command: GenerateCommand) -> int:
-    from collector.objects.procedural.catalogue import CATEGORIES
-    from collector.objects.procedural.writing import generate
-    from shared.categories import expanded
+    from collector.objects.procedural.catalogue import CATEGORIES, generate
+    from shared.tasks import expanded
 
     counts = dict.fromkeys(expanded(command.categories) or CATEGORIES, command.per_category)
     made = generate(command.out, counts, command.seed)
@@ -241,8 +240,7 @@ def _export(command: ExportCommand) -> int:
 
 def _check(command: CheckCommand) -> int:
     from collector.objects.catalogue import for_task, of_categories, scan
-    from shared.categories import expanded
-    from shared.tasks import task_of
+    from shared.tasks import expanded, task_of
 
     lists = () if command.object_list is None else (command.object_list,)
     catalogue = of_categories(scan(command.path, *lists, anew=True), expanded(command.categories))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+from pydantic import Field
 
 from cluster.config.flags import parse_flags
 from shared.config import MAX_NOISE, PANDA
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from shared.policies.policy import Policy
 
 BUILT_IN_PER_CATEGORY = 4
-MAX_ROLLOUTS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class RehearseCommand:
     """A folder of objects in PartNet-Mobility's layout; default: procedural objects."""
     policy: str | None = None
     """The name of a bundled policy, a folder with weights.safetensors and policy.json, or a finished run."""
-    rollouts: int = 1
+    rollouts: Annotated[int, Field(ge=1, le=1000)] = 1
     """With --policy: how many objects with freshly drawn hidden dynamics, each in a folder of its own, are tried."""
     budget: int = 4
     """With --policy: the most interactions before the final action."""
@@ -72,8 +72,6 @@ def main(args: list[str]) -> int:
     from adaafford.histories import MAX_TRIES
 
     command = parse_flags(RehearseCommand, args, "rehearse", RehearseCommand(tyro.MISSING, tyro.MISSING))
-    if not 1 <= command.rollouts <= MAX_ROLLOUTS:
-        raise UsageError(f"--rollouts {command.rollouts}: allowed are 1 to {MAX_ROLLOUTS}")
     if command.policy is None and command.rollouts != 1:
         raise UsageError(f"--rollouts {command.rollouts}: needs --policy; a robot has one object in front of it")
     if not 0 <= command.noise <= MAX_NOISE:
@@ -106,7 +104,7 @@ def _robots(command: RehearseCommand, gripper: str) -> Iterator["SimulatedRobot"
     from cluster.cli.library import simulated
     from cluster.config.objects import built_in_categories
     from cluster.evaluation.rehearsal import Setting, SimulatedRobot
-    from collector.objects.procedural.writing import generate
+    from collector.objects.procedural.catalogue import generate
     from shared.tasks import task_of
 
     make_folder(command.folder)

@@ -13,8 +13,7 @@ from shared.errors import UsageError
 from shared.progress import Progress
 
 if TYPE_CHECKING:
-    from shared.plan import Job
-    from shared.records import RolloutRecord
+    from shared.plan import Job, RolloutRecord
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from pydantic import Field
 
 from cluster.config.flags import parse_flags
-from shared.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -31,15 +31,13 @@ class StatusCommand:
     """Print one JSON object, once."""
     once: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the table once, also on a terminal."""
-    every: float = 2.0
+    every: Annotated[float, Field(gt=0)] = 2.0
     """Seconds between two updates."""
 
 
 def main(args: list[str]) -> int:
     """Show."""
     command = parse_flags(StatusCommand, args, "status")
-    if command.every <= 0:
-        raise UsageError(f"--every must be above 0; given {command.every}")
     from cluster.runs.status_snapshot import snapshot_of
 
     if command.json:

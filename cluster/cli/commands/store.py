@@ -26,30 +26,21 @@ MOST_SHOWN = 20
 """Rows with other labels that `verify --resimulate` prints; `--json` lists all."""
 
 
-@dataclass(frozen=True, slots=True)
-class InfoCommand:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InfoCommand(upkeep.StoreCommand):
     """Print the contents of a store."""
 
-    store: Annotated[str, tyro.conf.Positional]
-    """Folder or s3:// URL of the store."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print one JSON object instead of text."""
 
-
-@dataclass(frozen=True, slots=True)
-class VerifyCommand:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VerifyCommand(upkeep.StoreCommand):
     """Recompute every checksum and rule of a store; the exit code is 1 if anything is wrong."""
 
-    store: Annotated[str, tyro.conf.Positional]
-    """Folder or s3:// URL of the store."""
     resimulate: int = 0
     """Also execute this many random rows again, and print how much the results differ; needs --objects."""
     objects: Path | None = None
     """Folder of the store's objects."""
     seed: int = 1
     """Seed for the choice of rows."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print one JSON object instead of text."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,26 +17,27 @@ MOST_SHOWN = 20
 """Lines of one kind that are printed; --json has all."""
 
 
-@dataclass(frozen=True, slots=True)
-class RepairCommand:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoreCommand:
+    """Flags of the actions on one store that also print JSON."""
+
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or s3:// URL of the store."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RepairCommand(StoreCommand):
     """Set aside what is broken, delete nothing, and say what to collect again. Stop all collection first."""
 
-    store: Annotated[str, tyro.conf.Positional]
-    """Folder or s3:// URL of the store."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print one JSON object instead of text."""
 
-
-@dataclass(frozen=True, slots=True)
-class CompactCommand:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompactCommand(StoreCommand):
     """Make large shards of small ones; the small ones are set aside, the digest stays. Stop all collection first."""
 
-    store: Annotated[str, tyro.conf.Positional]
-    """Folder or s3:// URL of the store."""
     rollouts: int = 256
     """The most that one shard may hold."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print one JSON object instead of text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +52,10 @@ class MergeCommand:
     """Print one JSON object instead of text."""
 
 
-@dataclass(frozen=True, slots=True)
-class ExportCommand:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportCommand(StoreCommand):
     """Write a store as plain files that other tools open, with a data card. The same command again goes on."""
 
-    store: Annotated[str, tyro.conf.Positional]
-    """Folder or s3:// URL of the store."""
     out: str
     """A new folder, or s3:// URL with nothing below it."""
     format: str = "plain"
@@ -73,8 +72,6 @@ class ExportCommand:
     push: str = ""
     """USER/NAME of a data set on the Hugging Face Hub to put the files into; needs huggingface_hub, and HF_TOKEN in the
     environment."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print one JSON object instead of text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +102,7 @@ def _writing(execute: Callable[[Any], int]) -> Callable[[Any], int]:
 
 
 def _refuse_while_collecting(where: str) -> None:
-    """Refuse a store whose last driver says that it is at work; another machine's lock may not be seen from here.
-
-    Raises:
-        UsageError: it does.
-    """
+    """Refuse a store whose last driver says that it is at work; another machine's lock may not be seen from here."""
     import time
 
     from cluster.collection.status_writer import SILENT_S, read_status
@@ -124,8 +117,8 @@ def _refuse_while_collecting(where: str) -> None:
 
 
 def _repair(command: RepairCommand) -> int:
-    from shared.reproduction import reproduction
     from shared.store import repair
+    from shared.store.layout import reproduction
 
     _refuse_while_collecting(command.store)
     with Progress("verifying, shards") as progress:

@@ -21,7 +21,7 @@ from collector.objects.urdf_bodies import listed
 from collector.objects.writing import write_object
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.extras import require_packages
-from shared.io.files import TEMPORARY_PREFIX, read_bounded, remove_tree
+from shared.io.files import TEMPORARY_PREFIX, read_bounded, remove_tree, writing
 from shared.io.text import plain, short
 
 MAX_META_BYTES = 1 << 20
@@ -135,7 +135,7 @@ def _write(folder: Path, model: ObjectModel, source: Source) -> ArticulatedObjec
     """Write the object, if it can be read again."""
     digest = hashlib.sha256(read_bounded(source.file, 1 << 30)).hexdigest()
     meta = {IMPORTED: {"file": source.file.name, "layout": source.layout, "sha256": digest}}
-    try:
+    with writing(folder, "name a folder that can"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=folder.parent) as scratch:
             written = write_object(Path(scratch) / folder.name, model, meta)
@@ -145,8 +145,6 @@ def _write(folder: Path, model: ObjectModel, source: Source) -> ArticulatedObjec
                 raise ObjectError(str(error).replace(str(written), str(source.file))) from None
             remove_tree(folder)
             written.rename(folder)
-    except OSError as error:
-        raise UsageError(f"{folder}: cannot be written ({error.strerror}); name a folder that can") from None
     return judged
 
 

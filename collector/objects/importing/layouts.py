@@ -29,13 +29,7 @@ ARTICULATE_PROGRAMS = ("joint_pred.py", "link_placement.py")
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """An object that is to be imported.
-
-    Attributes:
-        file: the URDF or MJCF.
-        layout: what stands around it.
-        name: what the object is called.
-    """
+    """An object that is to be imported."""
 
     file: Path
     layout: Layout

@@ -1,6 +1,5 @@
 """Procedural articulated objects in PartNet-Mobility's layout, for machines that have none of the real ones."""
 
-from collector.objects.procedural.catalogue import CATEGORIES, EVERY_CATEGORY, build, categories_of
-from collector.objects.procedural.writing import generate
+from collector.objects.procedural.catalogue import CATEGORIES, EVERY_CATEGORY, build, categories_of, generate
 
 __all__ = ["CATEGORIES", "EVERY_CATEGORY", "build", "categories_of", "generate"]

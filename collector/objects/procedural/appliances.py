@@ -1,4 +1,8 @@
-"""Appliances with a door and controls: Microwave, WashingMachine."""
+"""Cases with one door and controls: Microwave, WashingMachine, ButtonCabinet, HandleCabinet.
+
+Nothing shows which of several controls works the latch of a cabinet's door. Without a hidden latch (`shared.hidden`)
+the door is free, and the controls move.
+"""
 
 import numpy as np
 
@@ -57,3 +61,58 @@ def _button(face: float, y: float, z: float, half: float) -> MovablePart:
     """A button on a front at x = `face`, which goes in when it is pressed."""
     piece = block((face - BUTTON_TRAVEL, y - half, z - half), (face - 0.002, y + half, z + half))
     return sliding("button", (piece,), BACK, 0.9 * BUTTON_TRAVEL)
+
+
+PRESS, PULL_OUT = 0.012, 0.03
+"""How far a button goes in, and how far a handle comes out."""
+TILT = 0.12
+"""rad: how far a paddle tilts."""
+PLATE = 0.04
+"""Thickness of door and panel."""
+
+
+def random_button_cabinet(rng: np.random.Generator) -> ObjectModel:
+    """A door without any grip, and beside it a panel with three or four buttons, or paddles that tilt inward."""
+    width, depth, height = float(rng.uniform(0.75, 0.9)), float(rng.uniform(0.4, 0.6)), float(rng.uniform(1.15, 1.3))
+    side = 1.0 if rng.random() < 0.5 else -1.0
+    half, split = width / 2, side * (width / 2 - 0.4)
+    panel, opening = sorted((split, side * half)), sorted((split, -side * half))
+    body = (
+        *hollow_box((0.0, -half, 0.0), (depth, half, height), 0.03, (FRONT,)),
+        block((-PLATE, panel[0] + GAP / 2, 0.0), (0.0, panel[1], height)),
+    )
+    low, high = (-GAP - PLATE, opening[0] + GAP / 2, 0.0), (-GAP, opening[1] - GAP / 2, height)
+    hinge = (low[0], high[1] if side < 0 else low[1], height / 2)
+    door = hinged("door", (block(low, high),), hinge, LEFT if side < 0 else RIGHT, FRONT, float(rng.uniform(1.4, 1.8)))
+    count, middle = int(rng.integers(3, 5)), (panel[0] + panel[1]) / 2
+    make = _large_button if rng.random() < 0.5 else _paddle
+    heights = (np.arange(count) + 0.5) / count * (height - 0.1) + 0.05
+    return ObjectModel("ButtonCabinet", "cabinet_body", body, (door, *(make(middle, float(z)) for z in heights)))
+
+
+def random_handle_cabinet(rng: np.random.Generator) -> ObjectModel:
+    """A door that carries two or three bars, each of which comes out a little when it is pulled."""
+    width, depth, height = float(rng.uniform(0.8, 1.1)), float(rng.uniform(0.5, 0.7)), float(rng.uniform(1.0, 1.4))
+    half, left = width / 2, bool(rng.random() < 0.5)
+    body = hollow_box((0.0, -half, 0.0), (depth, half, height), 0.03, (FRONT,))
+    low, high = (-GAP - PLATE, -half, 0.0), (-GAP, half, height)
+    hinge = (low[0], half if left else -half, height / 2)
+    door = hinged("door", (block(low, high),), hinge, LEFT if left else RIGHT, FRONT, float(rng.uniform(1.4, 1.8)))
+    count, free = int(rng.integers(2, 4)), (-1.0 if left else 1.0) * (half - 0.12)
+    heights = (np.arange(count) + 0.5) / count * (height - 0.1) + 0.05
+    bars = (grip((low[0] - GAP, free, float(z)), TOP, FRONT, 0.24, 0.07, 0.016) for z in heights)
+    handles = (MovablePart("handle", "prismatic", bar, (0.0, 0.0, 0.0), FRONT, PULL_OUT, parent=0) for bar in bars)
+    return ObjectModel("HandleCabinet", "cabinet_body", body, (door, *handles))
+
+
+def _large_button(y: float, z: float) -> MovablePart:
+    """A button on the panel, which goes in when it is pressed."""
+    face = -PLATE - GAP - PRESS
+    return sliding("button", (block((face - 0.04, y - 0.13, z - 0.11), (face, y + 0.13, z + 0.11)),), BACK, PRESS)
+
+
+def _paddle(y: float, z: float) -> MovablePart:
+    """A plate before the panel, whose lower edge goes in when it is pressed."""
+    face = -PLATE - 0.04
+    pieces: Pieces = (block((face - 0.025, y - 0.13, z - 0.12), (face, y + 0.13, z + 0.1)),)
+    return MovablePart("lever", "revolute", pieces, (face, y, z + 0.1), RIGHT, TILT)

@@ -11,15 +11,7 @@ GRID = 2.0**-14
 """Coordinates are multiples of this, so that moving them between frames rounds nothing: twins stay identical."""
 
 
-def hinged(
-    name: str,
-    pieces: Pieces,
-    corner: Point,
-    edge: Point,
-    outward: Point,
-    upper: float,
-    parent: int | None = None,
-) -> MovablePart:
+def hinged(name: str, pieces: Pieces, corner: Point, edge: Point, outward: Point, upper: float) -> MovablePart:
     """A panel that turns outward about one of its edges.
 
     Its axis runs along the outer face: a panel turned there leaves its frame and its neighbours without touching them.
@@ -31,11 +23,8 @@ def hinged(
         edge: direction from the panel's middle to the edge that it turns about.
         outward: direction in which the far edge moves first.
         upper: how far it opens, rad.
-        parent: see `MovablePart`.
     """
-    return MovablePart(
-        name, "revolute", pieces, corner, point(np.cross(np.negative(edge), outward)), upper, parent=parent
-    )
+    return MovablePart(name, "revolute", pieces, corner, point(np.cross(np.negative(edge), outward)), upper)
 
 
 def sliding(name: str, pieces: Pieces, direction: Point, upper: float) -> MovablePart:

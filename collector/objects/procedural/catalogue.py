@@ -1,11 +1,17 @@
-"""Which categories there are, and one object of each from a seed."""
+"""Which categories there are, one object of each from a seed, and folders of them."""
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
 
 from collector.objects.model import ObjectModel
-from collector.objects.procedural.appliances import random_microwave, random_washing_machine
+from collector.objects.procedural.appliances import (
+    random_button_cabinet,
+    random_handle_cabinet,
+    random_microwave,
+    random_washing_machine,
+)
 from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import (
     random_refrigerator,
@@ -21,8 +27,15 @@ from collector.objects.procedural.containers import (
 )
 from collector.objects.procedural.faucets import random_faucet
 from collector.objects.procedural.fitted import random_cabinet
-from collector.objects.procedural.latched import random_button_cabinet, random_handle_cabinet
-from collector.objects.procedural.openings import random_door, random_switch, random_window
+from collector.objects.procedural.openings import (
+    random_door,
+    random_switch,
+    random_window,
+)
+from collector.objects.writing import write_object
+from shared.errors import UsageError
+from shared.io.files import TEMPORARY_PREFIX, remove_if_abandoned, writing
+from shared.io.text import short
 from shared.seeds import generator
 from shared.tasks import Task
 
@@ -56,3 +69,36 @@ def categories_of(task: Task) -> list[str]:
 def build(category: str, seed: int, index: int) -> ObjectModel:
     """Object number `index` of a category: a pure function of its arguments, whatever else is made."""
     return normalised(EVERY_CATEGORY[category](generator(seed, f"procedural {category}", index)))
+
+
+def generate(out: Path, counts: Mapping[str, int], seed: int) -> list[Path]:
+    """Write `counts[category]` objects of each category below `out`; what is there already is kept.
+
+    Object number i of a category depends on the seed, the category and i alone. An object appears whole or not at all.
+
+    Args:
+        out: folder of objects; made if need be.
+        counts: how many of each category of `EVERY_CATEGORY`.
+        seed: of the whole collection, non-negative.
+
+    Returns:
+        The objects' folders, category by category.
+
+    Raises:
+        UsageError: an unknown category, a negative count or seed, or a folder that cannot be written or holds another
+            object of the same name.
+    """
+    unknown = sorted(set(counts) - set(EVERY_CATEGORY))
+    if unknown:
+        raise UsageError(f"unknown category {short(unknown[0])}; allowed: {', '.join(EVERY_CATEGORY)}")
+    if seed < 0 or min(counts.values(), default=0) < 0:
+        raise UsageError(f"seed and counts must not be negative; given seed {seed}, counts {dict(counts)}")
+    with writing(out, "name a folder that can"):
+        out.mkdir(parents=True, exist_ok=True)
+        for remnant in out.glob(f"{TEMPORARY_PREFIX}*"):
+            remove_if_abandoned(remnant)
+        return [
+            write_object(out / f"{category.lower()}-{index:04d}", build(category, seed, index))
+            for category, count in counts.items()
+            for index in range(count)
+        ]

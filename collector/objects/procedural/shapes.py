@@ -59,8 +59,9 @@ def hollow_box(low: Point, high: Point, wall: float, openings: Collection[Point]
     return tuple(pieces)
 
 
-def tub(bottom_radius: float, top_radius: float, low: float, high: float, wall: float, sides: int = 16) -> Pieces:
+def tub(bottom_radius: float, top_radius: float, low: float, high: float, wall: float) -> Pieces:
     """A round vessel about the z axis, open at the top: staves around, and a floor."""
+    sides = 16
     angles = 2 * np.pi * (np.arange(sides + 1) + 0.5) / sides
     pieces = [rod((0.0, 0.0, low), (0.0, 0.0, low + wall), bottom_radius - wall / 2, sides=sides)]
     for first, second in pairwise(angles):
@@ -79,9 +80,9 @@ def ring(low: Point, high: Point, width: float) -> Pieces:
     return hollow_box(low, high, width, (FRONT, BACK))
 
 
-def arch(radius: float, thickness: float, lean: float, segments: int = 8) -> Pieces:
+def arch(radius: float, thickness: float, lean: float) -> Pieces:
     """Half a hoop about the origin from +y to -y, leaning `lean` rad from upright towards -x."""
-    angles = np.pi * np.arange(segments + 1) / segments
+    angles = np.pi * np.arange(9) / 8
     points = [
         (-radius * np.sin(a) * np.sin(lean), radius * np.cos(a), radius * np.sin(a) * np.cos(lean)) for a in angles
     ]

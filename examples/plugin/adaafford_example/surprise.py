@@ -11,9 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from learner.data.cached_features import FrozenPrior
 from learner.data.dataset import Dataset, Split
-from learner.data.features import FrozenFeatures
+from learner.data.features import FrozenFeatures, FrozenPrior
 from learner.data.sampling import draw_numbers, order_rows, spread
 from learner.settings import TrainingConfig
 from learner.stages.trainers import BaselineTraining, Load, StageTrainer

@@ -225,11 +225,7 @@ class S3Backend:
 
 
 def _parsed(url: str) -> tuple[str, str]:
-    """Bucket and prefix of a URL.
-
-    Raises:
-        UsageError: it is not allowed.
-    """
+    """Bucket and prefix of a URL."""
     scheme, _, rest = url.partition("://")
     if "@" in rest:
         # Never repeated in a message, since it would end in a log.

@@ -15,7 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from shared.hidden import ALWAYS_DRAWN, NAME, hidden_parameter
-from shared.records import InteractionRecord, RolloutRecord, RolloutStatus
+from shared.plan import InteractionRecord, RolloutRecord, RolloutStatus
 from shared.types import Direction, Float, Order, OutcomeKind, Role
 
 Row = TypeVar("Row")

@@ -1,22 +1,22 @@
-"""Compaction: adjacent small shards become large ones, which cost less to list and to open. The digest stays.
+"""Compaction: adjacent small shards become large ones, which cost less to list and to open; and its reverse, reopening.
 
-The large shard is committed first, then the small ones are set aside, so that a crash at any moment loses nothing; as
-long as both are there, readers take each rollout from the large one (see `shared.store.coverage`).
+What is new is committed first, then what it replaces is set aside, so that a crash at any moment loses nothing; as long
+as both are there, readers take each rollout from the larger shard (see `shared.store.coverage`). The digest stays.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from shared.errors import StoreError, UsageError
-from shared.plan import Job
+from shared.plan import Job, RolloutStatus
 from shared.store import reader
 from shared.store.codecs.tables import joined
-from shared.store.coverage import Window, order, overlapping, parts_of
+from shared.store.coverage import Part, Window, order, overlapping, parts_of
 from shared.store.layout import MAX_ALL_PIXELS, MAX_ALL_POINTS, MAX_ROWS, SHARDS_FOLDER, ShardManifest
 from shared.store.maintenance.repair import set_aside
 from shared.store.presence import alone
 from shared.store.store import Store
-from shared.store.writer import Unknown, commit_shard
+from shared.store.writer import Unknown, commit_part, commit_shard
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,3 +136,37 @@ def _retire(store: Store, job: Job) -> str:
     key = f"{SHARDS_FOLDER}/{job.shard_id}"
     set_aside(store.backend, key)
     return key
+
+
+def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
+    """Take the quarantined rollouts of some plans out of their shards, so that they count as missing; returns how many.
+
+    What else such a shard holds is committed in shards of its own, before and after each such rollout.
+
+    Raises:
+        StoreError: a shard is damaged.
+    """
+    count = 0
+    for part in [part for key in plan_keys for part in store.parts(key)]:
+        manifest = store.manifest(part.shard)
+        if not manifest.quarantined:
+            continue
+        shard, rollouts = reader.shard_folder(store.backend, manifest.shard_id), store.read_rollouts(manifest.shard_id)
+        wanted = {rollout.index for rollout in rollouts if rollout.status is RolloutStatus.QUARANTINED}
+        kept = [Job(manifest.plan_key, *ends) for ends in _ranges(manifest.start, manifest.stop, wanted)]
+        # What a compaction has not set aside yet holds these rollouts as well.
+        old = [job for job in store.jobs(manifest.plan_key) if job.start < manifest.stop and manifest.start < job.stop]
+        for job in kept:
+            commit_part(store.backend, shard, manifest, Part(manifest.job, job.start, job.stop), "split_from")
+        for job in sorted(set(old) - set(kept), key=lambda job: job.stop - job.start):
+            set_aside(store.backend, f"{SHARDS_FOLDER}/{job.shard_id}")
+        count += len(wanted)
+    return count
+
+
+def _ranges(start: int, stop: int, without: set[int]) -> Iterator[tuple[int, int]]:
+    """The half-open ranges from `start` to `stop` that are left without some numbers."""
+    for number in [*sorted(without), stop]:
+        if start < number:
+            yield start, number
+        start = number + 1

@@ -2,7 +2,7 @@
 
 OUT/
   README.md        the data card
-  croissant.json   the same for programs (see `shared.store.maintenance.croissant`)
+  croissant.json   the same for programs (see `shared.store.maintenance.datacard`)
   setting.json     how all of it was collected
   ...              the data, as the format has them (see `shared.store.maintenance.formats`)
 
@@ -10,8 +10,10 @@ See `shared.store.maintenance.destinations` for how it is called while it is wri
 """
 
 import hashlib
+import importlib
 import itertools
 import json
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -19,15 +21,14 @@ from pathlib import Path
 from typing import Any
 
 from shared.errors import UsageError
+from shared.extras import require_packages
 from shared.io.files import write_atomically
 from shared.io.text import MAX_WORD, plain
 from shared.seeds import generator
 from shared.store.backends.base import is_url
-from shared.store.maintenance.croissant import croissant
-from shared.store.maintenance.datacard import SplitFigures, data_card
+from shared.store.maintenance.datacard import SplitFigures, croissant, data_card
 from shared.store.maintenance.destinations import NOTES, Destination, destination
 from shared.store.maintenance.formats import EXPORT_FORMATS, PLAIN, ExportFormat
-from shared.store.maintenance.hub import pusher
 from shared.store.maintenance.steps import Content, Splits, survey
 from shared.store.store import Store
 
@@ -152,3 +153,46 @@ def _check_splits(store: Store, splits: Splits) -> None:
             if odd:
                 raise UsageError(f"split '{name}': object '{min(odd)}' {what}; list each object of the store once")
         seen |= objects
+
+
+TOKEN = "HF_TOKEN"  # noqa: S105 - the variable's name.
+_REPO = r"[A-Za-z0-9][A-Za-z0-9._-]{0,95}/[A-Za-z0-9][A-Za-z0-9._-]{0,95}"
+_LONGEST = 200
+_REASONS = {401: f"the token in {TOKEN} is not accepted", 403: f"the token in {TOKEN} may not write there"}
+"""By the status of an answer."""
+_LATER = "try again later"
+
+
+def pusher(repo: str, leave: str) -> Callable[[Path], None]:
+    """What puts a folder on the Hugging Face Hub; whatever can be known before the work starts is checked here.
+
+    The token is taken from HF_TOKEN alone, and the server from HF_ENDPOINT, if that is set.
+
+    Args:
+        repo: "USER/NAME" of the data set, which is made where it is not there.
+        leave: name of a folder within that is not put there.
+
+    Raises:
+        UsageError: it is no such name, the package is not installed, or there is no token. What is returned
+            raises it, too, where the server refuses or cannot be reached.
+    """
+    if not re.fullmatch(_REPO, repo):
+        raise UsageError(f"--push '{plain(repo, _LONGEST)}': is no name of a data set; give USER/NAME")
+    require_packages("--push", "huggingface_hub")
+    if not os.environ.get(TOKEN):
+        raise UsageError(f"--push needs a token that may write; put it into the environment as {TOKEN}")
+
+    def push(folder: Path) -> None:
+        hub: Any = importlib.import_module("huggingface_hub")
+        api = hub.HfApi(endpoint=os.environ.get("HF_ENDPOINT") or None, token=os.environ[TOKEN])
+        try:
+            api.create_repo(repo, repo_type="dataset", exist_ok=True)
+            api.upload_folder(repo_id=repo, folder_path=folder, repo_type="dataset", ignore_patterns=[f"{leave}/*"])
+        except Exception as error:
+            status = getattr(getattr(error, "response", None), "status_code", None)
+            lines = str(error).strip().splitlines() or [type(error).__name__]
+            why = _LATER if status and status >= 500 else _REASONS.get(status or 0, plain(lines[0], _LONGEST))
+            answer = "the Hub cannot be reached" if status is None else f"the Hub answered {status}"
+            raise UsageError(f"--push {repo}: {answer} ({why}); the same command goes on") from error
+
+    return push

@@ -5,9 +5,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from shared.reproduction import OBJECTS, STORE, reproduction
-from shared.store.codecs.checksummed import with_checksum
-from shared.store.layout import INTERACTIONS_FILE, ROLLOUTS_FILE, Quarantined, ShardManifest
+from shared.io.documents import with_checksum
+from shared.store.layout import (
+    INTERACTIONS_FILE,
+    OBJECTS,
+    ROLLOUTS_FILE,
+    STORE,
+    Quarantined,
+    ShardManifest,
+    reproduction,
+)
 from shared.store.store import Store
 from shared.types import OutcomeKind
 

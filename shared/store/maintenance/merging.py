@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from shared.errors import StoreError, UsageError
+from shared.io.documents import difference_of
 from shared.plan import Job, Plan, parse_plan_key
 from shared.store import reader
 from shared.store.coverage import Part, Window, overlapping, parts_of
-from shared.store.maintenance.difference import difference_of
 from shared.store.presence import alone
 from shared.store.store import Store
-from shared.store.writer import Unknown, commit_shard, copy_shard
+from shared.store.writer import commit_part, copy_shard
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +101,7 @@ def _agreeing(held: Sequence[_Held]) -> int:
 
 
 def _refuse_overlaps(store: Store, ours: AbstractSet[Job]) -> None:
-    """Refuse a store that holds, in another shard, a rollout that is to be copied into it.
-
-    Raises:
-        StoreError: it does.
-    """
+    """Refuse a store that holds, in another shard, a rollout that is to be copied into it."""
     there = set(store.jobs())
     other = next((job for job in overlapping(there | ours, lambda job: job) if job not in ours), None)
     if other is not None:
@@ -119,18 +115,5 @@ def _copy(store: Store, source: Store, part: Part) -> None:
     manifest = reader.read_manifest(shard)
     if part.is_whole:
         copy_shard(shard, manifest, store.backend)
-        return
-    rollouts = reader.read_rollouts(shard, manifest)[part.start - manifest.start : part.stop - manifest.start]
-    commit_shard(
-        store.backend,
-        part.job,
-        rollouts,
-        manifest.points,
-        manifest.provenance | {"merged_from": manifest.shard_id},
-        [each for each in manifest.quarantined if part.start <= each.rollout < part.stop],
-        vetted=True,
-        unknown=Unknown(
-            {file: part.of(table) for file, table in reader.unknown_of(shard, manifest).items()},
-            manifest.more,
-        ),
-    )
+    else:
+        commit_part(store.backend, shard, manifest, part, "merged_from")

@@ -13,10 +13,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from shared.errors import SchemaVersionError, StoreError, UsageError
-from shared.io.documents import parse_object
+from shared.io.documents import parse_object, with_checksum, without_checksum
 from shared.store import policies, reader
 from shared.store.backends.base import Folder, StorageBackend, backend_of
-from shared.store.codecs.checksummed import with_checksum, without_checksum
 from shared.store.layout import (
     MANIFEST_FILE,
     MAX_DOCUMENT_BYTES,
@@ -27,6 +26,7 @@ from shared.store.layout import (
     STATUS_FOLDER,
     STORE_FILE,
     FileEntry,
+    file_entries,
     parse_manifest,
 )
 from shared.store.presence import alone
@@ -156,7 +156,7 @@ def _checked_files(folder: Folder, entries: Any) -> dict[str, bytes]:
     if any(".." in name.split("/") or name.startswith("/") for name in stated):
         raise StoreError(f"{folder}: names a file outside of it; it is foreign")
     files = {name: folder.read(name, entry.size) for name, entry in stated.items()}
-    for name, data in files.items():
-        if FileEntry(size=len(data), sha256=hashlib.sha256(data).hexdigest()) != stated[name]:
+    for name, entry in file_entries(files).items():
+        if entry != stated[name]:
             raise StoreError(f"{folder}/{name}: its size or SHA-256 is not what was committed; restore it from a copy")
     return files

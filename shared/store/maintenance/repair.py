@@ -12,10 +12,10 @@ from itertools import count
 from pathlib import Path
 
 from shared.errors import MissingError, SchemaVersionError, StoreError, UnreadableError
+from shared.io.documents import canonical, with_checksum
 from shared.plan import Job, Plan, Setting, covered, parse_plan_key
 from shared.store import reader
 from shared.store.backends.base import StorageBackend, backend_of
-from shared.store.codecs.checksummed import canonical, with_checksum
 from shared.store.coverage import order
 from shared.store.layout import (
     ASIDE_FOLDER,

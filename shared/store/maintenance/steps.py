@@ -22,9 +22,8 @@ from shared.errors import StoreError
 from shared.store.codecs.columns import INTERACTION_COLUMNS, interaction_columns
 from shared.store.codecs.observations import ObservationArrays
 from shared.store.codecs.tables import joined, schema_of, unknown_columns
-from shared.store.coverage import ROLLOUT_COLUMN, Part
+from shared.store.coverage import ROLLOUT_COLUMN, Part, Snapshot
 from shared.store.maintenance.datacard import SplitFigures
-from shared.store.snapshot import Snapshot
 from shared.store.store import Store
 
 GROUP_BYTES = 16 << 20
@@ -85,7 +84,6 @@ class Piece:
         of: how many pieces the split has.
         parts: what counts of each shard.
         first_episode: how many episodes of the split come before.
-        first_step: the same of steps.
         episodes: how many there are in the piece.
         steps: the same.
     """
@@ -95,7 +93,6 @@ class Piece:
     of: int
     parts: tuple[Part, ...]
     first_episode: int
-    first_step: int
     episodes: int
     steps: int
 
@@ -170,12 +167,12 @@ class Content:
                 size = 0
             groups[-1].append(part)
             size += part[2] * step_bytes
-        found, episode, step = list[Piece](), 0, 0
+        found, episode = list[Piece](), 0
         for number, group in enumerate(groups):
             episodes, steps = sum(each[1] for each in group), sum(each[2] for each in group)
             shards = tuple(part for part, *_ in group)
-            found.append(Piece(split, number, len(groups), shards, episode, step, episodes, steps))
-            episode, step = episode + episodes, step + steps
+            found.append(Piece(split, number, len(groups), shards, episode, episodes, steps))
+            episode += episodes
         return found
 
 

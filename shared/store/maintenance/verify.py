@@ -9,12 +9,10 @@ import numpy as np
 
 from shared.errors import MissingError, SchemaVersionError, StoreError, UnreadableError
 from shared.io.files import TEMPORARY_PREFIX
-from shared.plan import Job
-from shared.records import RolloutRecord
+from shared.plan import Job, RolloutRecord
 from shared.store import reader
 from shared.store.backends.base import Folder
 from shared.store.codecs.columns import COPIED_COLUMNS, InteractionRow, added_in, hidden_names, interaction_columns
-from shared.store.codecs.digest import rollout_digest
 from shared.store.codecs.tables import column_values
 from shared.store.coverage import Window, overlapping
 from shared.store.crash_log import CRASH_LOG_FOLDER
@@ -32,6 +30,7 @@ from shared.store.layout import (
 )
 from shared.store.policies import INDEX_FILE, folder_name
 from shared.store.store import Store
+from shared.store.writer import rollout_digest
 
 _FRAME_TOLERANCE = 1e-9
 """Camera-frame columns were computed by a matrix product, whose last bits depend on the machine."""

@@ -7,14 +7,13 @@ OUT/<split>-000000.tar
 
 import io
 import json
-import math
 import tarfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from shared.formatting import finite
 from shared.store.maintenance.formats import ExportFormat, Summary, nothing_to_finish, word
 from shared.store.maintenance.steps import CLOUD_COLUMNS, Content, Piece, cells, step_tables
 
@@ -31,7 +30,7 @@ def _write(content: Content, piece: Piece, folder: Path, shard_done: Callable[[]
                     array = io.BytesIO()
                     np.save(array, each[k], allow_pickle=False)
                     _add(tar, f"{key}.{name.removeprefix('observation.')}.npy", array.getvalue())
-                _add(tar, f"{key}.json", json.dumps(_without_nan(row), default=str).encode())
+                _add(tar, f"{key}.json", json.dumps(finite(row), default=str).encode())
     return {}
 
 
@@ -42,15 +41,6 @@ def _add(tar: tarfile.TarFile, name: str, data: bytes) -> None:
     tar.addfile(member, io.BytesIO(data))
     # Otherwise it remembers all members until it is closed.
     tar.members.clear()  # type: ignore[attr-defined]
-
-
-def _without_nan(value: Any) -> Any:
-    """A value with None in place of what JSON has no word for."""
-    if isinstance(value, dict):
-        return {name: _without_nan(each) for name, each in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _patterns(content: Content) -> Mapping[str, Sequence[str]]:

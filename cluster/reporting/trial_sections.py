@@ -1,21 +1,83 @@
-"""The interactions that AIP proposes, and how each changes the affordance, step by step (AdaAfford, Fig. 5)."""
+"""Single trials of an evaluation as clouds: what AIP proposes, and exploits that were believed in and that failed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
 
 from cluster.evaluation.trials import EvaluationTrial
-from cluster.reporting.clouds import CloudView, draw_panels, proposed, tried
+from cluster.reporting.clouds import Arrow, CloudView, draw_panels, proposed, tried
 from cluster.reporting.page import Drawing, Section, plain, shortened
-from cluster.reporting.words import after, hidden, verdict
+from cluster.reporting.style import FAILURE, after, hidden, verdict
+from shared.plan import InteractionRecord
 from shared.policies.adaptation import Adapter, movable_points
 from shared.types import Float32, Interaction, Observation
+
+SHOWN = 4
+LOOKED_AT = 60
+"""Failures that the critic is asked about, at the most."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailedExploit:
+    """An exploit that failed, and how much the critic believed in it."""
+
+    trial: EvaluationTrial
+    row: InteractionRecord
+    belief: float
+
+
+def failures_section(trials: Sequence[EvaluationTrial], adapter: Adapter) -> Section:
+    """The failures at the greatest budget, one of each kind before any kind comes again."""
+    key, title = "failures", "FailedExploit gallery"
+    last = [(trial, trial.exploits[-1]) for trial in trials if trial.exploits]
+    failed = [(trial, row) for trial, row in last if not row.outcome.success]
+    counted = f"{len(failed)} of the {len(last)} exploits that were looked at, at the greatest budget, failed."
+    if not failed:
+        return Section(key, title, (counted if last else "Nothing was exploited.",))
+    chosen = varied([_believed(trial, row, adapter) for trial, row in failed[:LOOKED_AT]])
+    lead = (
+        f"{counted} Here those that the critic believed in most, one of each kind of failure before any comes again: "
+        "the adapted affordance, and the action that it chose (red).",
+    )
+    figure = draw_panels([_panel(failure, adapter) for failure in chosen], len(chosen), ("AAP: affordance",))
+    caption = "; ".join(
+        f"{failure.trial.rollout.object.id}: {hidden(failure.trial.rollout.dynamics)}" for failure in chosen
+    )
+    return Section(key, title, lead, drawings=(Drawing(figure, f"Hidden facts. {caption}.", solid=True),))
+
+
+def varied(failures: Sequence[FailedExploit]) -> list[FailedExploit]:
+    """Some failures in order of belief, each kind of outcome once before any comes again."""
+    turns: dict[str, int] = {}
+    ranked = []
+    for failure in sorted(failures, key=lambda each: -each.belief):
+        kind = failure.row.outcome.kind.value
+        turns[kind] = turns.get(kind, -1) + 1
+        ranked.append((turns[kind], failure))
+    return [failure for _, failure in sorted(ranked, key=lambda pair: pair[0])][:SHOWN]
+
+
+def _believed(trial: EvaluationTrial, row: InteractionRecord, adapter: Adapter) -> FailedExploit:
+    score = adapter.score(trial.seen_by(row), [row.action], trial.before(row))
+    return FailedExploit(trial, row, float(score[0]))
+
+
+def _panel(failure: FailedExploit, adapter: Adapter) -> CloudView:
+    trial, row = failure.trial, failure.row
+    observation = trial.seen_by(row)
+    title = f"{plain(trial.rollout.object.id)}: believed {100 * failure.belief:.0f}%<br>{verdict(row.outcome)}"
+    values = adapter.affordance(observation, trial.before(row))
+    return CloudView(title, observation, values, (Arrow(row.action, FAILURE),))
+
 
 MOST_TRIES = 3
 """Two clouds a step; a browser draws no more than about sixteen at once."""
 
 
 def proposals_section(trial: EvaluationTrial | None, adapter: Adapter) -> Section:
-    """The evaluation trial whose interactions changed the affordance most."""
+    """What AIP proposes in a trial, and how each interaction changes the affordance (AdaAfford, Fig. 5)."""
     key, title = "proposals", "What AIP proposes, and how each interaction changes the affordance"
     if trial is None:
         return Section(key, title, ("AIP proposed no interaction in the evaluation.",))
