@@ -191,8 +191,7 @@ def _vertices(text: bytes, above: int, name: str) -> Float:
     """[V, 3], from lines of x y z, which a weight or a colour may follow; `above` are in the file before them."""
     _, counts = _words(np.frombuffer(text, np.uint8))
     plain = bool((counts == 3).all())
-    odd = [] if plain else np.flatnonzero(~np.isin(counts, (3, 4, 6, 7)))
-    if len(odd):
+    if not plain and len(odd := np.flatnonzero(~np.isin(counts, (3, 4, 6, 7)))):
         number = above + odd[0] + 1
         raise ObjectError(f"{name}: vertex {number} has {counts[odd[0]]} numbers instead of 3; truncated?")
     numbers = _numbers(text, np.float64)
