@@ -1,6 +1,6 @@
 """A plan's digest is the same for any number of workers, any order of jobs, a fresh process and an old one.
 
-Pushes have the same one on processors of different makers that have the same vector instructions.
+Pushes should have the same one on processors of different makers that have the same vector instructions.
 """
 
 import subprocess
@@ -21,8 +21,8 @@ from shared.tasks import task_named
 ROLLOUTS = 4
 CPU_INFO = Path("/proc/cpuinfo")
 PUSHES, NUMPY = "eb1f42a13f70958d47a6390dd401ddc7d3f9572ad4065adec57062fc88b72fb1", "2.4.6"
-"""The digest of some pushes with this release of NumPy on processors with AVX-512. With other vector instructions or
-another release, sums and sines may be rounded differently."""
+"""The digest of some pushes, with this release of NumPy on an AMD processor with AVX-512. With other vector
+instructions or another release, sums and sines may be rounded differently."""
 FLAGS = {
     "task": "pull",
     "seed": 11,
