@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.geometry import cross
 from shared.plan import ObjectRef
 from shared.types import Float
 
@@ -146,7 +147,7 @@ def joint_twist(joint: Joint, world_from_body: Float) -> Float:
     axis = world_from_body[:3, :3] @ joint.axis
     if joint.kind == "prismatic":
         return np.concatenate([np.zeros(3), axis])
-    return np.concatenate([axis, np.cross(world_from_body[:3, 3], axis)])
+    return np.concatenate([axis, cross(world_from_body[:3, 3], axis)])
 
 
 SURFACE_POINTS = 4096

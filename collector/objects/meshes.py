@@ -26,11 +26,16 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _VERTEX, _FACE = b"v ", b"f "
 _SKIPPED = (b"vn", b"vt", b"vp", b"o ", b"g ", b"s ", b"us", b"mt", b"l ", b"p ", b"o\n", b"g\n", b"s\n")
 _SPACE, _LINE_END, _SLASH, _COMMENT = b" \n/#"
+_MAY_BE_SKIPPED = np.zeros(1 << 16, dtype=np.bool_)
+"""Of two bytes at the beginning of a line: whether it is a comment, empty, or a statement that carries no geometry."""
+_MAY_BE_SKIPPED[[int.from_bytes(prefix, "big") for prefix in _SKIPPED]] = True
+_MAY_BE_SKIPPED.reshape(256, 256)[[_COMMENT, _LINE_END]] = True
 _BLANKS = b"\t\r\v\f"
 _STL_HEADER, _STL_TRIANGLE = 84, 50
 _STL_VERTEX = b"vertex "
 _BLOCK_BYTES = 2 << 20
 _BLOCK_TRIANGLES = 1 << 16
+_FIRST_TRIANGLES = 16
 _MIN_SINE = 1e-9
 """Of the angle at a triangle's first corner; a triangle with a smaller one is a line or a point."""
 
@@ -72,8 +77,10 @@ def checked(mesh: Mesh, name: str) -> Mesh:
 
 def _has_area(mesh: Mesh) -> bool:
     """Whether a triangle is more than a line or a point."""
-    for start in range(0, len(mesh.faces), _BLOCK_TRIANGLES):
-        first, second, third = mesh.vertices[mesh.faces[start : start + _BLOCK_TRIANGLES]].swapaxes(0, 1)
+    # Nearly always the first triangles have an area.
+    starts = [0, *range(_FIRST_TRIANGLES, len(mesh.faces), _BLOCK_TRIANGLES)]
+    for start, stop in zip(starts, [*starts[1:], len(mesh.faces)], strict=True):
+        first, second, third = mesh.vertices[mesh.faces[start:stop]].swapaxes(0, 1)
         a, b = second - first, third - first
         lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
         if (np.linalg.norm(np.cross(a, b), axis=1) > _MIN_SINE * lengths).any():
@@ -138,19 +145,16 @@ class _Lines:
         ends = np.flatnonzero(self._bytes[:-1] == _LINE_END)
         self._starts = np.concatenate([[0], ends[:-1] + 1])
         self._lengths = np.diff(self._starts, append=len(self._bytes) - 1)
+        self._prefixes = self._bytes[self._starts].astype(np.uint16) << 8 | self._bytes[self._starts + 1]
 
     def starts_with(self, prefix: bytes) -> NDArray[np.bool_]:
         """Which lines start with two bytes."""
-        found: NDArray[np.bool_] = self._bytes[self._starts] == prefix[0]
-        found &= self._bytes[self._starts + 1] == prefix[1]
+        found: NDArray[np.bool_] = self._prefixes == int.from_bytes(prefix, "big")
         return found
 
     def refuse_others(self, known: NDArray[np.bool_], name: str) -> None:
         """Refuse lines that are neither `known` nor one of OBJ's other statements."""
-        for prefix in _SKIPPED:
-            known = known | self.starts_with(prefix)
-        first = self._bytes[self._starts]
-        odd = np.flatnonzero(~known & (first != _COMMENT) & (first != _LINE_END))
+        odd = np.flatnonzero(~known & ~_MAY_BE_SKIPPED[self._prefixes])
         if len(odd):
             line = self._bytes[self._starts[odd[0]] :][: min(self._lengths[odd[0]], 40)].tobytes()
             raise ObjectError(f"{name}: not a Wavefront OBJ statement: {line.decode('ascii', 'replace').strip()!r}")
@@ -186,15 +190,15 @@ def _words(text: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.int64
 def _vertices(text: bytes, above: int, name: str) -> Float:
     """[V, 3], from lines of x y z, which a weight or a colour may follow; `above` are in the file before them."""
     _, counts = _words(np.frombuffer(text, np.uint8))
-    odd = np.flatnonzero(~np.isin(counts, (3, 4, 6, 7)))
-    if len(odd):
+    plain = bool((counts == 3).all())
+    if not plain and len(odd := np.flatnonzero(~np.isin(counts, (3, 4, 6, 7)))):
         number = above + odd[0] + 1
         raise ObjectError(f"{name}: vertex {number} has {counts[odd[0]]} numbers instead of 3; truncated?")
     numbers = _numbers(text, np.float64)
     if len(numbers) != counts.sum():
         word = next((word for word in text.split() if not len(_numbers(word, np.float64))), b"")
         raise ObjectError(f"{name}: a vertex is not a number ({word[:60].decode('ascii', 'replace')!r})")
-    if (counts != 3).any():
+    if not plain:
         numbers = numbers[((np.cumsum(counts) - counts)[:, None] + np.arange(3)).ravel()]
     return _bounded(numbers.reshape(-1, 3), name)
 

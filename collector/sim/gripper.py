@@ -9,7 +9,7 @@ step.
 Where the hand is, [4], counts from where it was placed: forward, left, up (m) and its turn about up (rad).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -32,6 +32,7 @@ ALONG = {
     "z": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
 }
 """Rotations whose first column is the named axis, since SAPIEN's joints move along or about their frame's x."""
+_NO_TURN = (1.0, 0.0, 0.0, 0.0)
 
 
 class Gripper(Protocol):
@@ -208,14 +209,20 @@ class FreeGripper:
     def __init__(self, shape: HandShape, palm: Link, fingers: tuple[Link, ...]) -> None:
         self.palm, self.fingers = palm, fingers
         self._open = shape.finger_open
+        self._finger_joints = opening_joints(fingers)
+        self._pace = np.nan
         self._articulation = palm.articulation
         self._still = np.zeros(self._articulation.dof, dtype=np.float32)
+        self._opened = np.full_like(self._still, self._open)
         self._drive = physx.PhysxDriveComponent(palm)
         palm.entity.add_component(self._drive)
         self._rotation, self._origin = np.eye(3), np.zeros(3)
 
     def set_pace(self, pace: float) -> None:
         """See `Gripper.set_pace`."""
+        if pace == self._pace:
+            return
+        self._pace = pace
         for set_property in (
             self._drive.set_drive_property_x,
             self._drive.set_drive_property_y,
@@ -223,25 +230,29 @@ class FreeGripper:
             self._drive.set_drive_property_slerp,
         ):
             set_property(ARM_STIFFNESS, ARM_DAMPING / pace)
-        set_finger_pace(self.fingers, pace)
+        set_finger_pace(self._finger_joints, pace)
 
     def place(self, rotation: Float, position: Float, *, opened: bool) -> None:
         """See `Gripper.place`."""
-        opening = self._open if opened else 0.0
         self._rotation, self._origin = rotation, position
-        self._drive.pose_in_parent = pose(frame(rotation, position))
+        self._drive.pose_in_parent = at = pose(frame(rotation, position))
         self.drive(still())
         self.drive_velocity(still())
-        self._articulation.set_qpos(np.full_like(self._still, opening))
-        drive_fingers(self.fingers, opening)
-        self.shift(still(), still())
+        self._articulation.set_qpos(self._opened if opened else self._still)
+        drive_fingers(self._finger_joints, self._open if opened else 0.0)
+        self._fly(at, np.zeros(3), np.zeros(3))
 
     def shift(self, place: Float, velocity: Float) -> None:
         """See `Gripper.shift`."""
-        turned = self._rotation @ rotation_about_z(place[3])
-        self._articulation.set_root_pose(pose(frame(turned, self._origin + self._rotation @ place[:3])))
-        self._articulation.set_root_linear_velocity(self._rotation @ velocity[:3])
-        self._articulation.set_root_angular_velocity(self._rotation[:, 2] * velocity[3])
+        turned = self._rotation @ rotation_about_z(place[3]) if place[3] else self._rotation
+        at = pose(frame(turned, self._origin + self._rotation @ place[:3]))
+        self._fly(at, self._rotation @ velocity[:3], self._rotation[:, 2] * velocity[3])
+
+    def _fly(self, at: sapien.Pose, linear: Float, angular: Float) -> None:
+        """Move the palm to a pose at once, with these velocities, [3] each, world; the fingers do not move in it."""
+        self._articulation.set_root_pose(at)
+        self._articulation.set_root_linear_velocity(linear)
+        self._articulation.set_root_angular_velocity(angular)
         self._articulation.set_qvel(self._still)
 
     def displacement(self) -> Float:
@@ -251,7 +262,8 @@ class FreeGripper:
     def drive(self, place: Float) -> None:
         """See `Gripper.drive`."""
         half = place[3] / 2
-        self._drive.set_drive_target(sapien.Pose(place[:3], [np.cos(half), 0.0, 0.0, np.sin(half)]))
+        turn = [np.cos(half), 0.0, 0.0, np.sin(half)] if half else _NO_TURN
+        self._drive.set_drive_target(sapien.Pose(place[:3], turn))
 
     def drive_velocity(self, velocity: Float) -> None:
         """See `Gripper.drive_velocity`."""
@@ -259,7 +271,7 @@ class FreeGripper:
 
     def close(self) -> None:
         """See `Gripper.close`."""
-        drive_fingers(self.fingers, 0.0)
+        drive_fingers(self._finger_joints, 0.0)
 
     def opening(self) -> float:
         """See `Gripper.opening`."""
@@ -289,21 +301,21 @@ def build_free(shape: HandShape, scene: sapien.Scene, material: physx.PhysxMater
     return FreeGripper(shape, hand, fingers)
 
 
-def _opening(fingers: tuple[Link, ...]) -> list[Link]:
-    """Those of the fingers that open."""
-    return [link for link in fingers if link.joint.type == "prismatic"]
+def opening_joints(fingers: tuple[Link, ...]) -> tuple[physx.PhysxArticulationJoint, ...]:
+    """The joints of those of the fingers that open."""
+    return tuple(link.joint for link in fingers if link.joint.type == "prismatic")
 
 
-def set_finger_pace(fingers: tuple[Link, ...], pace: float) -> None:
-    """See `Gripper.set_pace`."""
-    for link in _opening(fingers):
-        link.joint.set_drive_property(FINGER_STIFFNESS, FINGER_DAMPING / pace)
+def set_finger_pace(joints: Sequence[physx.PhysxArticulationJoint], pace: float) -> None:
+    """See `Gripper.set_pace`; for the joints of `opening_joints`."""
+    for joint in joints:
+        joint.set_drive_property(FINGER_STIFFNESS, FINGER_DAMPING / pace)
 
 
-def drive_fingers(fingers: tuple[Link, ...], opening: float) -> None:
-    """Drive each finger that opens to `opening`."""
-    for link in _opening(fingers):
-        link.joint.set_drive_target(opening)
+def drive_fingers(joints: Sequence[physx.PhysxArticulationJoint], opening: float) -> None:
+    """Drive each finger to `opening`; for the joints of `opening_joints`."""
+    for joint in joints:
+        joint.set_drive_target(opening)
 
 
 def make_weightless(link: Link, mass: float) -> None:

@@ -53,7 +53,7 @@ class JointedGripper:
         """See `Gripper.set_pace`."""
         for joint in self.joints[:6]:
             joint.set_drive_property(ARM_STIFFNESS, ARM_DAMPING / pace)
-        set_finger_pace(self.fingers, pace)
+        set_finger_pace(self.joints[6:], pace)
 
     def place(self, rotation: Float, position: Float, *, opened: bool) -> None:
         """See `Gripper.place`."""
@@ -90,7 +90,7 @@ class JointedGripper:
 
     def close(self) -> None:
         """See `Gripper.close`."""
-        drive_fingers(self.fingers, 0.0)
+        drive_fingers(self.joints[6:], 0.0)
 
     def opening(self) -> float:
         """See `Gripper.opening`."""

@@ -236,18 +236,19 @@ class Scene:
         finger_on, palm, brushes, clearance = set(), False, False, CONTACT_RANGE
         for contact in self.system.get_contacts():
             first, second = contact.bodies
-            if (first in self._hand) == (second in self._hand):
+            if (of_hand := first in self._hand) == (second in self._hand):
                 continue
             strongest = 0.0
             for point in contact.points:
                 separation = point.separation
                 clearance = min(clearance, separation)
                 if separation < TOUCHING:
-                    strongest = max(strongest, float(point.impulse @ point.impulse))
+                    impulse = point.impulse
+                    strongest = max(strongest, float(impulse @ impulse))
             brushes = brushes or strongest > 0.0
             if strongest <= self._impulse_squared:
                 continue
-            hand, other = (first, second) if first in self._hand else (second, first)
+            hand, other = (first, second) if of_hand else (second, first)
             if hand == self.gripper.palm:
                 palm = True
             else:

@@ -137,6 +137,9 @@ class Trial:
         gripper, steps = self.scene.gripper, self._timing.leg_steps
         path = np.linspace(self._hand_at, end, steps + 1)
         velocity = (end - self._hand_at) * (self._timing.steps_per_second / steps)
+        stride = float(np.linalg.norm(path[1, :3] - path[0, :3]))
+        # A hand that turns may come nearer than its way tells.
+        flies = self.fidelity.skip_free_flight and stride > 0 and path[0, 3] == path[-1, 3]
         gripper.drive_velocity(velocity)
         step, ahead = 0, 1
         while step < steps:
@@ -147,42 +150,46 @@ class Trial:
             if rests and self._grasps and self.fidelity.version > 1 and not gripper.holds():
                 raise _TrialEndedError(self._kind())
             if (
-                self.fidelity.skip_free_flight
+                flies
                 and not self._attached
                 and (rests or not self._checked)
-                and (skipped := self._free_flight(path, step))
+                and (skipped := self._free_flight(path, step, stride))
             ):
                 step += skipped
                 gripper.shift(path[step], velocity)
-            ahead = min(self._ahead(path, ahead), steps - step)
+            ahead = min(self._ahead(stride, ahead), steps - step)
         gripper.drive(end)
         gripper.drive_velocity(still())
         self._hand_at = end
 
-    def _free_flight(self, path: Float, step: int) -> int:
+    def _free_flight(self, path: Float, step: int, stride: float) -> int:
         """How many steps after `step` of the leg along `path`, [steps + 1, 4], will touch and move nothing.
 
         These need not be simulated. The hand is put ahead by no more than its clearance, so that it cannot pass through
         anything, and only while the object rests: before the first contact, or once the hand has let go of it.
+
+        Args:
+            path: of the hand's target.
+            step: the present one.
+            stride: how far the hand's target moves in a step.
         """
         if self._checked:
             self._clearance = self.scene.contact().clearance
-        stride = float(np.linalg.norm(path[1, :3] - path[0, :3]))
-        # A hand that turns may come nearer than its way tells.
-        if self._clearance <= CLEARANCE or stride == 0 or path[0, 3] != path[-1, 3]:
+        room = self._clearance - CLEARANCE
+        if room / stride < LEAST_SKIP:
             return 0
         lag = float(np.linalg.norm(path[step, :3] - self.scene.gripper.displacement()))
-        ahead = min(int((self._clearance - CLEARANCE - lag) / stride), len(path) - 1 - step)
+        ahead = min(int((room - lag) / stride), len(path) - 1 - step)
         return ahead if ahead >= LEAST_SKIP else 0
 
-    def _ahead(self, path: Float, ahead: int) -> int:
-        """How many steps of the leg along `path`, [steps + 1, 4], the target moves at the next step of the engine.
+    def _ahead(self, stride: float, ahead: int) -> int:
+        """How many steps of its leg the target moves at the next step of the engine.
 
         Twice as many as last time while hand and object stand still, since what holds them up then only bears more; one
         otherwise. Every fourth step is looked at, or every one where the target moves by more.
 
         Args:
-            path: of the hand's target.
+            stride: how far the hand's target moves in a step of the leg.
             ahead: how many it moved last time.
         """
         touched = self._checked or self._brushed
@@ -194,7 +201,6 @@ class Trial:
             return 1
         moved, span = np.abs(now - before[1]), self.steps - before[0]
         joints = len(self.scene.joints)
-        stride = float(np.linalg.norm(path[1, :3] - path[0, :3]))
         prepares = self._timing is self.fidelity.approach and self.primitive.then is not None
         most, share = PREPARING if prepares else DECISIVE
         if (

@@ -140,8 +140,8 @@ class RecordedTrial(Trial):
             if self._contact is None and self.scene.contact().brushes:
                 self._contact = len(self._times) - 1
 
-    def _free_flight(self, path: Float, step: int) -> int:
-        skipped = super()._free_flight(path, step)
+    def _free_flight(self, path: Float, step: int, stride: float) -> int:
+        skipped = super()._free_flight(path, step, stride)
         # Where the hand is not simulated it flies straight on, and does not turn.
         start = _hand_of(self.scene)
         for ahead in range(1, skipped + 1):
