@@ -138,6 +138,14 @@ class PlaceEncoder(nn.Module):
         return torch.stack(told).sum(dim=0)
 
 
+def told_of_points(
+    features: Tensor, points: Tensor, place_encoder: PlaceEncoder | None, config: NetworkConfig
+) -> list[Tensor]:
+    """What a D network is told of points: f_p|O, and how a `PlaceEncoder`, where there is one, encodes the rest."""
+    told = [point_features(features, config)]
+    return told if place_encoder is None else [*told, place_encoder(features, points)]
+
+
 def present(**modules: nn.Module | None) -> nn.ModuleDict:
     """Those of some modules that there are, by name."""
     return nn.ModuleDict({name: module for name, module in modules.items() if module is not None})
@@ -173,9 +181,9 @@ class Head(nn.Module):
         whole = nn.Linear(sum(widths_in), config.feature_width)
         # Drawn as one layer, so that the spread of the weights is that of the concatenation.
         self.inputs = nn.ParameterList(
-            nn.Parameter(part.clone()) for part in torch.split(whole.weight.detach(), list(widths_in), dim=1)
+            nn.Parameter(dense_copy(part)) for part in torch.split(whole.weight, list(widths_in), dim=1)
         )
-        self.bias = nn.Parameter(whole.bias.detach().clone())
+        self.bias = nn.Parameter(dense_copy(whole.bias))
         self.factors = nn.ModuleList(
             nn.Linear(width, config.feature_width) for width in (widths_in[-2:] if product else ())
         )
@@ -203,6 +211,12 @@ class Head(nn.Module):
             one, other = (factor(x) for factor, x in zip(self.factors, inputs[-2:], strict=True))
             hidden = hidden + one * other
         return _as_tensor(self.output(functional.leaky_relu(hidden)))
+
+
+def dense_copy(weights: Tensor) -> Tensor:
+    """A copy of some weights of a layer, without a gradient."""
+    # On the meta device, on which policies are read, the default format would import SymPy, half a second of work.
+    return weights.detach().clone(memory_format=torch.contiguous_format)
 
 
 def _as_tensor(x: object) -> Tensor:
