@@ -1,6 +1,6 @@
 """Multilayer perceptrons over the last axis, and heads over several inputs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +10,8 @@ from shared.networks.actions import FRAME_WIDTH, PLACE_SCALE, action_inputs, act
 from shared.networks.network_config import NetworkConfig
 from shared.pinch import PROFILE_WIDTH
 
+PIECE = 64
+"""Rows in a piece; see `in_pieces`."""
 SURROUNDINGS_SCALE = 10.0
 """Offsets of the nearest points, some hundredths of a unit, come to some tenths."""
 
@@ -65,12 +67,17 @@ class SurroundingsEncoder(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.each = PointwiseMlp(3, (32, 64), "none")
+        # ReLU and maximum commute, and ReLU is cheaper after it.
+        self.each = PointwiseMlp(3, (32, 64), "none", last_relu=False)
         self.together = VectorEncoder(64, config)
 
     def forward(self, offsets: Tensor) -> Tensor:
         """Offsets from p, [..., k, 3], to [..., feature_width]."""
-        return _as_tensor(self.together(self.each(SURROUNDINGS_SCALE * offsets).amax(dim=-2)))
+        pooled = in_pieces(self._pooled, offsets.flatten(0, -3))
+        return _as_tensor(self.together(pooled.reshape(*offsets.shape[:-2], pooled.shape[-1])))
+
+    def _pooled(self, offsets: Tensor) -> Tensor:
+        return torch.relu(_as_tensor(self.each(SURROUNDINGS_SCALE * offsets)).amax(dim=-2))
 
 
 class ActionEncoder(nn.Module):
@@ -136,6 +143,16 @@ class PlaceEncoder(nn.Module):
         if self.around is not None:
             told.append(_as_tensor(self.around(surrounding_offsets(features, self.config))))
         return torch.stack(told).sum(dim=0)
+
+
+def in_pieces(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """A function of each row of `x`, computed some rows at a time where no gradient is kept.
+
+    What a piece needs for its hidden layers stays in the processor's cache, and is not asked from the system each time.
+    """
+    if torch.is_grad_enabled() or len(x) <= PIECE:
+        return function(x)
+    return torch.cat([function(piece) for piece in torch.split(x, PIECE)])
 
 
 def told_of_points(
