@@ -2,7 +2,8 @@
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -114,7 +115,8 @@ class Worker:
             UsageError: the setting needs packages that are not installed.
         """
         check_packages(plan.setting)
-        return run_rollout(plan, index, self._load(plan, index, clock), partial(self._proposer, plan), clock)
+        with _one_thread() if plan.policy_version else nullcontext():
+            return run_rollout(plan, index, self._load(plan, index, clock), partial(self._proposer, plan), clock)
 
     def _explain(self, job: Job, quarantined: Mapping[int, str]) -> list[Quarantined]:
         """The manifest's entries of quarantined rollouts."""
@@ -145,6 +147,19 @@ class Worker:
         if version not in self._adapters:
             self.load_policy(version, self._store.read_policy(version))
         return proposer_named(name, self._adapters[version], rng, plan.most_tries, share)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """PyTorch with one thread, as in the process of an actor: several wait for each other longer than they compute."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _empty(records: Sequence[RolloutRecord]) -> dict[str, dict[str, int]]:

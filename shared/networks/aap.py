@@ -5,7 +5,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from shared.networks.actions import outcome_inputs, outcome_width
-from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features, present
+from shared.networks.layers import (
+    ActionEncoder,
+    Head,
+    PlaceEncoder,
+    VectorEncoder,
+    point_features,
+    present,
+    told_of_points,
+)
 from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import PointNet2
 
@@ -115,11 +123,15 @@ class Aap(nn.Module):
 
         Arguments as for `action_logits`; for what D is told beyond the paper see `PlaceEncoder`.
         """
-        features = features.detach()
-        inputs = [point_features(features, self.config), latents.detach()]
-        if self.place_encoder is not None:
-            inputs.insert(1, self.place_encoder(features, points))
-        logits: Tensor = self.affordance_head(*inputs)
+        return self.affordance(self.told_of_points(features, points), latents)
+
+    def told_of_points(self, features: Tensor, points: Tensor) -> list[Tensor]:
+        """What D is told of points beside z; arguments as for `actionability`."""
+        return told_of_points(features.detach(), points, self.place_encoder, self.config)
+
+    def affordance(self, told: list[Tensor], latents: Tensor) -> Tensor:
+        """`actionability` of points of which `told_of_points` was computed before."""
+        logits: Tensor = self.affordance_head(*told, latents.detach())
         return torch.sigmoid(logits.squeeze(-1))
 
     def affordance_network(self) -> nn.Module:

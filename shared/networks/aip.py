@@ -2,7 +2,15 @@
 
 from torch import Tensor, nn
 
-from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, VectorEncoder, point_features, present
+from shared.networks.layers import (
+    ActionEncoder,
+    Head,
+    PlaceEncoder,
+    VectorEncoder,
+    point_features,
+    present,
+    told_of_points,
+)
 from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import PointNet2
 
@@ -56,13 +64,16 @@ class Aip(nn.Module):
             latents: z, [..., latent_width].
             aap_actionability: a^AAP_p|z in [0, 1], [...].
         """
-        features = features.detach()
-        inputs = [point_features(features, self.config)]
-        if self.place_encoder is not None:
-            inputs.append(self.place_encoder(features, points))
-        scores: Tensor = self.affordance_head(
-            *inputs, self.actionability_encoder(aap_actionability[..., None]), latents
-        )
+        return self.affordance(self.told_of_points(features, points), latents, aap_actionability)
+
+    def told_of_points(self, features: Tensor, points: Tensor) -> list[Tensor]:
+        """What D is told of points beside z and AAP's D; arguments as for `actionability`."""
+        return told_of_points(features.detach(), points, self.place_encoder, self.config)
+
+    def affordance(self, told: list[Tensor], latents: Tensor, aap_actionability: Tensor) -> Tensor:
+        """`actionability` of points of which `told_of_points` was computed before."""
+        believed = self.actionability_encoder(aap_actionability[..., None])
+        scores: Tensor = self.affordance_head(*told, believed, latents)
         return SCORE_SCALE * scores.squeeze(-1)
 
     def affordance_network(self) -> nn.Module:

@@ -61,16 +61,16 @@ def group_cloud(points: Float32, config: NetworkConfig) -> Grouping:
     return Grouping(tuple(neighbours), tuple(nearest))
 
 
-def nearest_points(points: Float32, count: int) -> Indices:
-    """The `count` nearest of a cloud's points to each of them, [N, count]; too few repeat the farthest.
+def nearest_points(tree: cKDTree, asked: Float32, count: int) -> NDArray[np.int64]:
+    """The `count` nearest of the cloud in a tree to each of some places, [Q, count]; too few repeat the farthest.
 
     The same as `shared.networks.pointnet2.surroundings` finds for single points of many clouds.
     """
     if not count:
-        return np.zeros((len(points), 0), dtype=np.int16)
-    ranks = np.arange(1, min(count, len(points)) + 1)
-    found = np.asarray(cKDTree(points).query(points, k=ranks)[1])
-    return np.pad(found, ((0, 0), (0, count - len(ranks))), mode="edge").astype(np.int16)
+        return np.zeros((len(asked), 0), dtype=np.int64)
+    ranks = np.arange(1, min(count, tree.n) + 1)
+    found = np.asarray(tree.query(asked, k=ranks)[1])
+    return np.pad(found, ((0, 0), (0, count - len(ranks))), mode="edge")
 
 
 def _within(points: Float32, centres: Float32, count: int, radius: float) -> Indices:

@@ -1,6 +1,6 @@
 """Multilayer perceptrons over the last axis, and heads over several inputs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +10,8 @@ from shared.networks.actions import FRAME_WIDTH, PLACE_SCALE, action_inputs, act
 from shared.networks.network_config import NetworkConfig
 from shared.pinch import PROFILE_WIDTH
 
+PIECE = 64
+"""Rows in a piece; see `in_pieces`."""
 SURROUNDINGS_SCALE = 10.0
 """Offsets of the nearest points, some hundredths of a unit, come to some tenths."""
 
@@ -65,12 +67,17 @@ class SurroundingsEncoder(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.each = PointwiseMlp(3, (32, 64), "none")
+        # ReLU and maximum commute, and ReLU is cheaper after it.
+        self.each = PointwiseMlp(3, (32, 64), "none", last_relu=False)
         self.together = VectorEncoder(64, config)
 
     def forward(self, offsets: Tensor) -> Tensor:
         """Offsets from p, [..., k, 3], to [..., feature_width]."""
-        return _as_tensor(self.together(self.each(SURROUNDINGS_SCALE * offsets).amax(dim=-2)))
+        pooled = in_pieces(self._pooled, offsets.flatten(0, -3))
+        return _as_tensor(self.together(pooled.reshape(*offsets.shape[:-2], pooled.shape[-1])))
+
+    def _pooled(self, offsets: Tensor) -> Tensor:
+        return torch.relu(_as_tensor(self.each(SURROUNDINGS_SCALE * offsets)).amax(dim=-2))
 
 
 class ActionEncoder(nn.Module):
@@ -138,6 +145,24 @@ class PlaceEncoder(nn.Module):
         return torch.stack(told).sum(dim=0)
 
 
+def in_pieces(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """A function of each row of `x`, computed some rows at a time where no gradient is kept.
+
+    What a piece needs for its hidden layers stays in the processor's cache, and is not asked from the system each time.
+    """
+    if torch.is_grad_enabled() or len(x) <= PIECE:
+        return function(x)
+    return torch.cat([function(piece) for piece in torch.split(x, PIECE)])
+
+
+def told_of_points(
+    features: Tensor, points: Tensor, place_encoder: PlaceEncoder | None, config: NetworkConfig
+) -> list[Tensor]:
+    """What a D network is told of points: f_p|O, and how a `PlaceEncoder`, where there is one, encodes the rest."""
+    told = [point_features(features, config)]
+    return told if place_encoder is None else [*told, place_encoder(features, points)]
+
+
 def present(**modules: nn.Module | None) -> nn.ModuleDict:
     """Those of some modules that there are, by name."""
     return nn.ModuleDict({name: module for name, module in modules.items() if module is not None})
@@ -173,9 +198,9 @@ class Head(nn.Module):
         whole = nn.Linear(sum(widths_in), config.feature_width)
         # Drawn as one layer, so that the spread of the weights is that of the concatenation.
         self.inputs = nn.ParameterList(
-            nn.Parameter(part.clone()) for part in torch.split(whole.weight.detach(), list(widths_in), dim=1)
+            nn.Parameter(dense_copy(part)) for part in torch.split(whole.weight, list(widths_in), dim=1)
         )
-        self.bias = nn.Parameter(whole.bias.detach().clone())
+        self.bias = nn.Parameter(dense_copy(whole.bias))
         self.factors = nn.ModuleList(
             nn.Linear(width, config.feature_width) for width in (widths_in[-2:] if product else ())
         )
@@ -203,6 +228,12 @@ class Head(nn.Module):
             one, other = (factor(x) for factor, x in zip(self.factors, inputs[-2:], strict=True))
             hidden = hidden + one * other
         return _as_tensor(self.output(functional.leaky_relu(hidden)))
+
+
+def dense_copy(weights: Tensor) -> Tensor:
+    """A copy of some weights of a layer, without a gradient."""
+    # On the meta device, on which policies are read, the default format would import SymPy, half a second of work.
+    return weights.detach().clone(memory_format=torch.contiguous_format)
 
 
 def _as_tensor(x: object) -> Tensor:

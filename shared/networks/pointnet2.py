@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from shared.networks.grouping import Grouping
-from shared.networks.layers import Normalisation, PointwiseMlp
+from shared.networks.layers import Normalisation, PointwiseMlp, dense_copy
 from shared.networks.network_config import NetworkConfig
 from shared.types import Float32
 
@@ -202,8 +202,8 @@ class SetAbstraction(nn.Module):
     def __init__(self, width_in: int, widths: Sequence[int], kind: str) -> None:
         super().__init__()
         whole = nn.Linear(3 + width_in, widths[0], bias=False)
-        self.from_offset = nn.Parameter(whole.weight.detach()[:, :3].clone())
-        self.from_feature = nn.Parameter(whole.weight.detach()[:, 3:].clone())
+        self.from_offset = nn.Parameter(dense_copy(whole.weight[:, :3]))
+        self.from_feature = nn.Parameter(dense_copy(whole.weight[:, 3:]))
         self.bias = nn.Parameter(torch.zeros(widths[0]))
         self.neighbour_norm = Normalisation(widths[0], kind) if kind == "batch" else nn.Identity()
         self.rest = PointwiseMlp(widths[0], widths[1:], kind if kind == "batch" else "none", last_relu=False)
@@ -220,9 +220,10 @@ class SetAbstraction(nn.Module):
             from_features = gather(functional.linear(features, self.from_feature, self.bias), neighbours)
             hidden = from_features + functional.linear(offsets, self.from_offset)
         # The maximum by `max` sends its gradient to one neighbour; that of `amax` costs three passes over all of them.
-        # ReLU and maximum commute, and ReLU is cheaper after it.
+        # Without a gradient `amax` is the faster one. ReLU and maximum commute, and ReLU is cheaper after it.
         hidden = self.neighbour_norm(hidden)
-        pooled = (self.rest(torch.relu(hidden)) if len(self.rest.layers) else hidden).max(dim=2).values
+        hidden = self.rest(torch.relu(hidden)) if len(self.rest.layers) else hidden
+        pooled = hidden.max(dim=2).values if torch.is_grad_enabled() else hidden.amax(dim=2)
         return torch.relu(self.centre_norm(pooled))
 
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from shared.networks.actions import FRAME_WIDTH, orthonormal_frames
-from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, point_features, present
+from shared.networks.layers import ActionEncoder, Head, PlaceEncoder, point_features, present, told_of_points
 from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import PointNet2
 
@@ -53,10 +53,15 @@ class Prior(nn.Module):
 
     def actionability(self, features: Tensor, points: Tensor) -> Tensor:
         """Actionability a_p in [0, 1] (Where2Act), [...]; features and points as for `action_logits`."""
-        inputs = [point_features(features, self.config)]
-        if self.place_encoder is not None:
-            inputs.append(self.place_encoder(features, points))
-        return torch.sigmoid(_single(self.affordance_head(*inputs)))
+        return self.affordance(self.told_of_points(features, points))
+
+    def told_of_points(self, features: Tensor, points: Tensor) -> list[Tensor]:
+        """What D is told of points; arguments as for `actionability`."""
+        return told_of_points(features, points, self.place_encoder, self.config)
+
+    def affordance(self, told: list[Tensor]) -> Tensor:
+        """`actionability` of points of which `told_of_points` was computed before."""
+        return torch.sigmoid(_single(self.affordance_head(*told)))
 
     def affordance_network(self) -> nn.Module:
         """All that D has of its own."""

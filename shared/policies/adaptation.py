@@ -1,7 +1,7 @@
 """Adaptation at test time: predictions of a policy, given a history of interactions with one object.
 
-Everything here runs on the CPU in a few milliseconds a step, needs only a policy, and is deterministic for a given
-random generator. `shared.policies.proposers` chooses interactions.
+Everything here runs on the CPU in some tens of milliseconds a step, needs only a policy, and is deterministic for a
+given random generator. `shared.policies.proposers` chooses interactions.
 
 Shapes: N points of a cloud, A actions, S proposals at a point.
 """
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from shared.arms.reach import reachable_points
@@ -20,8 +21,10 @@ from shared.errors import UsageError
 from shared.geometry import gripper_rotation, points_in_view, view_from_world
 from shared.networks.aap import Aap
 from shared.networks.actions import FRAME_WIDTH, middle_of, outcome_details
+from shared.networks.aip import Aip
 from shared.networks.grouping import group_cloud, nearest_points
-from shared.networks.pointnet2 import CloudBatch, EncodedClouds, PointNet2
+from shared.networks.pointnet2 import CloudBatch, EncodedClouds
+from shared.networks.prior import Prior
 from shared.pinch import PROFILE_WIDTH, pinch_profiles
 from shared.policies.methods import ModuleName
 from shared.policies.policy import Policy
@@ -30,18 +33,40 @@ from shared.types import Action, Float, Float32, Interaction, Observation
 PROPOSALS = 100
 """Actions sampled at a point (AdaAfford, Next-step Interaction Action Proposal)."""
 MAX_CACHED_OBSERVATIONS = 64
+MAX_ASKED_POINTS = 12
+"""Sets of points for which D's inputs are kept, some megabytes each: of the present observations, not of a history."""
 
 
 @dataclass(slots=True)
 class _Entry:
-    """Cached results of one observation; the reference to it prevents that its id is reused."""
+    """Cached results of one observation; the reference to it prevents that its id is reused.
+
+    Attributes:
+        observation: it.
+        clouds: its cloud, with the neighbours of each point.
+        tree: finds the surroundings of a point.
+        middle: of the movable points, [3].
+        dense: [M, 3], the surface at full resolution, where networks are told pinch profiles.
+        encoded: the cloud under a module's encoder.
+        codes: code and attention weight of interactions on this observation, by module, action and outcome.
+    """
 
     observation: Observation
     clouds: CloudBatch
-    around: NDArray[np.int16]
+    tree: cKDTree
     middle: Tensor
     dense: Float32 | None
-    encoded: dict[str, EncodedClouds]
+    encoded: dict[ModuleName, EncodedClouds]
+    codes: dict[tuple[ModuleName, int, bytes, str], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True, slots=True)
+class _AskedPoints:
+    """What a D network is told of points of an observation, whatever was tried; the references are as in `_Entry`."""
+
+    observation: Observation
+    points: NDArray[np.int64]
+    told: list[Tensor]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +85,8 @@ class Proposals:
 class Adapter:
     """A policy at test time.
 
-    Clouds are encoded when first needed and cached by the identity of their observation, so a history costs one small
-    network a step.
+    Clouds are encoded when first needed and cached by the identity of their observation, and so is what does not depend
+    on the history: an interaction is encoded once, and a new history costs the last layers of D.
 
     Example:
         >>> adapter = Adapter(Policy.from_files(files))
@@ -73,13 +98,14 @@ class Adapter:
         self.policy = policy
         policy.modules().eval()
         self._entries: OrderedDict[int, _Entry] = OrderedDict()
+        self._asked: OrderedDict[tuple[int, ModuleName], _AskedPoints] = OrderedDict()
 
     def encode(self, observation: Observation, module: ModuleName = "aap") -> EncodedClouds:
         """The observation's cloud under a module's encoder, computed once."""
         entry = self._entry(observation)
         if module not in entry.encoded:
             with torch.inference_mode():
-                entry.encoded[module] = self._encoder(module)(entry.clouds)
+                entry.encoded[module] = self._module(module).encoder(entry.clouds)
         return entry.encoded[module]
 
     @torch.inference_mode()
@@ -134,16 +160,13 @@ class Adapter:
         points: NDArray[np.int64] | None = None,
     ) -> Float32:
         """A_I: the AAP actionability after a history, in [0, 1], of every point, [N], or of `points` only."""
-        asked = np.arange(len(observation.points)) if points is None else points
-        features, places = self.features(observation, module, asked), self.places(observation, asked)
-        return self._adaptive(module).actionability(features, places, self.z(history, module)).numpy()
+        told = self._told_of_points(observation, module, points)
+        return self._adaptive(module).affordance(told, self.z(history, module)).numpy()
 
     @torch.inference_mode()
     def prior_affordance(self, observation: Observation, points: NDArray[np.int64] | None = None) -> Float32:
         """A: Where2Act's actionability, in [0, 1], of every point, [N], or of `points` only."""
-        asked = np.arange(len(observation.points)) if points is None else points
-        features, places = self.features(observation, "prior", asked), self.places(observation, asked)
-        return self.policy.prior.actionability(features, places).numpy()
+        return self.policy.prior.affordance(self._told_of_points(observation, "prior", points)).numpy()
 
     @torch.inference_mode()
     def score(
@@ -172,9 +195,12 @@ class Adapter:
     def features(self, observation: Observation, module: ModuleName, points: NDArray[np.int64]) -> Tensor:
         """A module's features of points and of their surroundings, [len(points), point_width]."""
         index, entry = torch.from_numpy(points), self._entry(observation)
-        features = self._encoder(module).features_at(self.encode(observation, module), torch.zeros_like(index), index)
-        around = torch.from_numpy(entry.around[points].astype(np.int64))
-        offsets = entry.clouds.points[0, around] - entry.clouds.points[0, index][:, None]
+        features = self._module(module).encoder.features_at(
+            self.encode(observation, module), torch.zeros_like(index), index
+        )
+        at = entry.clouds.points[0, index]
+        around = torch.from_numpy(nearest_points(entry.tree, at.numpy(), self.policy.config.surroundings))
+        offsets = entry.clouds.points[0, around] - at[:, None]
         return torch.cat([features, offsets.flatten(1)], dim=-1)
 
     def places(self, observation: Observation, points: NDArray[np.int64]) -> Tensor:
@@ -238,10 +264,25 @@ class Adapter:
     @torch.inference_mode()
     def information(self, observation: Observation, points: NDArray[np.int64], latent: Tensor) -> Float32:
         """The AIP actionability a^AIP_p|z of the points at the indices `points`, [len(points)]."""
-        places = self.places(observation, points)
-        expected = self.policy.aap.actionability(self.features(observation, "aap", points), places, latent)
-        features = self.features(observation, "aip", points)
-        return self.policy.aip.actionability(features, places, latent, expected).numpy()
+        expected = self.policy.aap.affordance(self._told_of_points(observation, "aap", points), latent)
+        told = self._told_of_points(observation, "aip", points)
+        return self.policy.aip.affordance(told, latent, expected).numpy()
+
+    @torch.inference_mode()
+    def _told_of_points(
+        self, observation: Observation, module: ModuleName, points: NDArray[np.int64] | None
+    ) -> list[Tensor]:
+        """What a module's D network is told of points, [N] or given by index, whatever was tried."""
+        asked = np.arange(len(observation.points)) if points is None else points
+        key = id(observation), module
+        kept = self._asked.pop(key, None)
+        if kept is None or kept.observation is not observation or not np.array_equal(kept.points, asked):
+            features, places = self.features(observation, module, asked), self.places(observation, asked)
+            kept = _AskedPoints(observation, asked, self._module(module).told_of_points(features, places))
+        self._asked[key] = kept
+        if len(self._asked) > MAX_ASKED_POINTS:
+            self._asked.popitem(last=False)
+        return kept.told
 
     def _entry(self, observation: Observation) -> _Entry:
         entry = self._entries.get(id(observation))
@@ -249,9 +290,10 @@ class Adapter:
             points = points_in_view(observation)
             clouds = CloudBatch.of([points], [group_cloud(points, self.policy.config)])
             middle = middle_of(clouds.points[0], torch.from_numpy(observation.movable))
-            around = nearest_points(points, self.policy.config.surroundings)
             dense = dense_in_view(observation) if self.policy.config.pinch_profile else None
-            entry = self._entries[id(observation)] = _Entry(observation, clouds, around, middle, dense, {})
+            entry = self._entries[id(observation)] = _Entry(
+                observation, clouds, cKDTree(points), middle, dense, encoded={}, codes={}
+            )
             if len(self._entries) > MAX_CACHED_OBSERVATIONS:
                 self._entries.popitem(last=False)
         self._entries.move_to_end(id(observation))
@@ -264,14 +306,14 @@ class Adapter:
         self.policy.require(module)
         return self.policy.baseline(module, Aap)
 
-    def _encoder(self, module: ModuleName) -> PointNet2:
+    def _module(self, module: ModuleName) -> Prior | Aap | Aip:
         match module:
             case "prior":
-                return self.policy.prior.encoder
+                return self.policy.prior
             case "aip":
-                return self.policy.aip.encoder
+                return self.policy.aip
             case _:
-                return self._adaptive(module).encoder
+                return self._adaptive(module)
 
     def _history_codes(self, history: Sequence[Interaction], module: ModuleName) -> tuple[Tensor, Tensor]:
         """Codes, [K, latent_width], and attention weights, [K], of interactions."""
@@ -281,15 +323,21 @@ class Adapter:
         return torch.cat([code for code, _ in parts]), torch.cat([weight for _, weight in parts])
 
     def _interaction_code(self, interaction: Interaction, module: ModuleName) -> tuple[Tensor, Tensor]:
-        index, outcome = np.array([interaction.action.point_index]), interaction.outcome
-        return self._adaptive(module).interaction_codes(
-            self.features(interaction.observation, module, index),
-            self.places(interaction.observation, index),
-            self.frames(interaction.observation, [interaction.action]),
-            torch.tensor([outcome.motion], dtype=torch.float32),
-            torch.tensor([float(outcome.success)]),
-            torch.from_numpy(outcome_details([outcome.kind], [outcome.grasp_opening])),
-        )
+        observation, action, outcome = interaction.observation, interaction.action, interaction.outcome
+        codes = self._entry(observation).codes
+        # By value, because a robot's interactions may be read anew at each step.
+        key = module, action.point_index, action.rotation.tobytes(), repr(outcome)
+        if key not in codes:
+            index = np.array([action.point_index])
+            codes[key] = self._adaptive(module).interaction_codes(
+                self.features(observation, module, index),
+                self.places(observation, index),
+                self.frames(observation, [action]),
+                torch.tensor([outcome.motion], dtype=torch.float32),
+                torch.tensor([float(outcome.success)]),
+                torch.from_numpy(outcome_details([outcome.kind], [outcome.grasp_opening])),
+            )
+        return codes[key]
 
 
 def movable_points(observation: Observation) -> NDArray[np.int64]:

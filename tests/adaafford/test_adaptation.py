@@ -128,6 +128,19 @@ def test_the_order_of_the_history_does_not_matter_and_the_history_does(adapter: 
     assert ((adapted >= 0) & (adapted <= 1)).all()
 
 
+def test_what_is_cached_changes_no_answer(adapter: Adapter) -> None:
+    observation = observation_of()
+    points, history = movable_points(observation), history_of(observation, 3)
+    for known in ([], history[:1], history, history[:1]):
+        for asked in (points, points[:7], None, points):
+            expected = Adapter(adapter.policy).affordance(observation, known, points=asked)
+            np.testing.assert_array_equal(adapter.affordance(observation, known, points=asked), expected)
+    other = [dataclasses.replace(each, outcome=Outcome(OutcomeKind.OK, 0.9, success=True)) for each in history]
+    expected = Adapter(adapter.policy).affordance(observation, other)
+    np.testing.assert_array_equal(adapter.affordance(observation, other), expected)
+    assert np.abs(expected - adapter.affordance(observation, history)).max() > 0
+
+
 def test_turning_object_and_camera_together_changes_nothing(adapter: Adapter) -> None:
     observation = observation_of()
     angle = 0.8

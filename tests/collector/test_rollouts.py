@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from pydantic import ValidationError
 
 from collector.domain_randomisation import draw_rollout, object_of
@@ -96,6 +97,20 @@ def test_a_worker_without_the_packages_of_a_setting_does_nothing(objects: Path, 
     worker = Worker(Store.create(tmp_path / "store", plan.setting).path, objects)
     with pytest.raises(UsageError, match=r"is of primitive twist: my-package 1\.2, but here is no package; install"):
         worker.run(plan, Job(plan.key, 0, 1))
+
+
+def test_a_policy_proposes_with_one_thread(objects: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_for(objects)
+    guided = Plan(setting=plan.setting, proposer="aip", policy_version=1)
+    worker, threads = Worker(Store.create(tmp_path / "store", plan.setting).path, objects), list[int]()
+    monkeypatch.setattr("collector.worker.run_rollout", lambda *_: threads.append(torch.get_num_threads()))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        worker.execute(guided, 0, StageClock())
+        assert (threads, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_a_job_done_twice_is_done_once(objects: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from scipy.spatial import cKDTree
 
 from shared.networks.aap import Aap
 from shared.networks.actions import (
@@ -143,7 +144,7 @@ def test_surroundings_are_the_nearest_points_and_turn_with_the_gripper() -> None
 @settings(max_examples=25, deadline=None)
 def test_a_whole_clouds_surroundings_are_those_of_its_points(size: int, count: int, seed: int) -> None:
     points = torch.randn(1, size, 3, generator=torch.Generator().manual_seed(seed))
-    around = nearest_points(points[0].numpy(), count).astype(np.int64)
+    around = nearest_points(cKDTree(points[0].numpy()), points[0].numpy(), count)
     assert around.shape == (size, count)
     if count:
         alone = surroundings(points, torch.zeros(size, dtype=torch.long), points[0], count)
