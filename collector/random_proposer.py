@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from shared.geometry import gripper_rotation
 from shared.types import Action, Float, Interaction, Observation
@@ -105,6 +104,8 @@ def edge_points(observation: Observation) -> NDArray[np.int64]:
     A point inside a patch has its neighbours all around it; near an edge they lie to one side, so that their centroid
     is away from it.
     """
+    from scipy.spatial import cKDTree  # A fifth of a worker's imports, and most tasks draw no edges.
+
     found = []
     for part in np.unique(observation.part_ids[observation.movable]):
         own = np.flatnonzero(observation.part_ids == part)

@@ -10,8 +10,9 @@ import re
 import secrets
 import signal
 import socket
+import subprocess
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Any
 
 import psutil
 
+from cluster.workers import ray_process
 from cluster.workers.worker_group import SerialWorkerGroup, WorkerGroup, make_worker
 from collector.job_result import WorkerFactory
 from collector.watchdog import Limits
@@ -36,7 +38,8 @@ ANSWER_S = 5.0
 AGENTS_S = 10.0
 """How long Ray's agents, which write to the session's folder, may take to end after it."""
 START_ATTEMPTS = 2
-"""How often Ray is started before a session is given up: Ray allows itself 30 s, too few for a busy machine."""
+"""How often Ray is started before a session is given up: Ray allows itself 30 s, too few for a busy machine. After the
+first attempt, Ray's own programs are used throughout: another version of Ray may need them."""
 RAY_PREFIX = "RAY_"
 """Of the environment variables that Ray reads."""
 
@@ -56,6 +59,15 @@ _UNUSED = ("start_monitor", "start_log_monitor", "start_api_server")
 """Methods of Ray's node that start its autoscaler, what follows its log files, and the server of its dashboard.
 
 A private session has no use for them, and each takes two seconds of a processor just when the workers start."""
+_REPLACED = ("_private/workers/default_worker.py", "dashboard/agent.py", "_private/runtime_env/agent/main.py")
+"""Programs of Ray in whose place `cluster.workers.ray_process` runs: the worker's, and those of two agents.
+
+The agents serve the dashboard, metrics, and environments of single tasks. A private session has none of these, but the
+raylet needs two agents that live, and their ports."""
+_PORTS = {"metrics_agent_port": -1, "metrics_export_port": -1, "dashboard_agent_listen_port": -1}
+"""Ports of the agents that are not in use, as the agents of Ray's minimal installation state them."""
+_NO_PORT = {"runtime_env_agent_port": 1}
+"""Nothing listens there, and no other user could."""
 _ADDRESS = re.compile(r"(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
 _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 _SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
@@ -225,7 +237,7 @@ def _private_session(workers: int) -> Iterator[None]:
     with without_foreign_settings(), ExitStack() as session:
         for attempt in range(START_ATTEMPTS):
             try:
-                session.enter_context(_started_session(workers))
+                session.enter_context(_started_session(workers, lean=attempt == 0))
                 break
             except WorkerError as error:
                 if attempt + 1 == START_ATTEMPTS:
@@ -235,8 +247,12 @@ def _private_session(workers: int) -> Iterator[None]:
 
 
 @contextmanager
-def _started_session(workers: int) -> Iterator[None]:
+def _started_session(workers: int, *, lean: bool) -> Iterator[None]:
     """A session in a folder of its own; of one that does not come up, no process and no folder is left.
+
+    Args:
+        workers: processors of the session.
+        lean: see `_start_on_loopback`.
 
     Raises:
         WorkerError: it does not come up.
@@ -246,7 +262,7 @@ def _started_session(workers: int) -> Iterator[None]:
         with _changed_environment({**_ENVIRONMENT, **token}), _ray() as ray:
             others = psutil.Process().children(recursive=True)
             try:
-                _start_on_loopback(workers, folder)
+                _start_on_loopback(workers, folder, lean=lean)
             except WorkerError:
                 ray.shutdown()
                 _kill(set(psutil.Process().children(recursive=True)) - set(others))
@@ -259,19 +275,29 @@ def _started_session(workers: int) -> Iterator[None]:
             psutil.wait_procs(processes, AGENTS_S)
 
 
-def _start_on_loopback(workers: int, folder: Path) -> None:
+def _start_on_loopback(workers: int, folder: Path, *, lean: bool) -> None:
     """Start Ray so that nothing listens beyond this machine: it executes code for whoever reaches its ports.
 
     Ray replaces 127.0.0.1 by the address that others would reach, except where it believes that clusters are not
     supported (as on macOS and Windows); so that belief is installed while the session starts.
+
+    Args:
+        workers: processors of the session.
+        folder: of the session.
+        lean: whether `cluster.workers.ray_process` runs in place of some programs of Ray.
     """
     import ray
-    from ray._private import ray_constants
+    from ray._private import ray_constants, services
     from ray._private.node import Node
 
     idle = {name: lambda self, **_: None for name in _UNUSED if hasattr(Node, name)}
+    start = services.start_ray_process
     try:
-        with _changed_attributes(ray_constants, {"ENABLE_RAY_CLUSTER": False}), _changed_attributes(Node, idle):
+        with (
+            _changed_attributes(ray_constants, {"ENABLE_RAY_CLUSTER": False}),
+            _changed_attributes(Node, idle),
+            _changed_attributes(services, {"start_ray_process": partial(_start_lean, start) if lean else start}),
+        ):
             ray.init(
                 address="local",
                 num_cpus=workers,
@@ -289,6 +315,26 @@ def _start_on_loopback(workers: int, folder: Path) -> None:
         # Ray has no class of its own for a session that does not come up in its 30 s.
         said = str(error).partition("\n")[0]
         raise WorkerError(f"Ray did not start ({said}); run the same command again, or with --workers 0") from error
+
+
+def _start_lean(start: Callable[..., Any], command: Sequence[str], process_type: str, **settings: Any) -> Any:
+    """Start a process of Ray by `start`; the raylet's workers start faster, and its agents only wait."""
+    if process_type != "raylet":
+        return start(command, process_type, **settings)
+    from ray import _raylet
+    from ray._private.services import RAY_PATH
+
+    native: Any = _raylet
+    options = dict(option.partition("=")[::2] for option in command)
+    for name, port in {**_PORTS, **_NO_PORT}.items():
+        native.persist_port(options["--session_dir"], options["--node_id"], name, port)
+    lean = list(command)
+    for program in _REPLACED:
+        theirs = str(Path(RAY_PATH, program))
+        both = subprocess.list2cmdline([ray_process.__file__, theirs])
+        # Each option of these is a command line in one string.
+        lean = [option.replace(f" {subprocess.list2cmdline([theirs])} ", f" {both} ") for option in lean]
+    return start(lean, process_type, **settings)
 
 
 @contextmanager
@@ -396,7 +442,8 @@ def _ray() -> Iterator[Any]:
     """Ray, made quiet, while it starts; what it has kept of the environment is read anew."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ray's own deprecations; a user can do nothing about them.
-        import ray
+        with ray_process.without_slow_imports():
+            import ray
         from ray import _raylet
         from ray._private import worker
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from shared.arms.arm import Arm
 from shared.arms.kinematics import chain_of
@@ -40,6 +39,8 @@ class ArmReach:
     """
 
     def __init__(self, arm: Arm, base: Sequence[float], primitive: PrimitiveSpec, surface: Float) -> None:
+        from scipy.spatial import cKDTree  # A fifth of a worker's imports, and most collections have no arm.
+
         self._chain = chain_of(arm)
         self._base_from_world = np.linalg.inv(base_pose(*base))
         local = surface.astype(np.float64) @ self._base_from_world[:3, :3].T + self._base_from_world[:3, 3]
@@ -88,6 +89,8 @@ def reachable_points(observation: Observation) -> NDArray[np.bool_]:
 
     A few points are asked, spread over the cloud; the others are as the nearest of these.
     """
+    from scipy.spatial import cKDTree
+
     assert observation.reach is not None, "the observation knows an arm"
     asked = np.flatnonzero(observation.movable)[:ASKED_POINTS]
     reached = []

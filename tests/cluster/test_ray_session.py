@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 from cluster.cli.commands import bench
-from cluster.workers import session
+from cluster.workers import ray_process, session
 from cluster.workers.session import ray_session
 from shared.errors import UsageError, WorkerError
 from shared.io import private
@@ -48,6 +48,7 @@ FOREIGN = {
 }
 """What a node, a job or a notebook of another cluster leaves in an environment, and worse."""
 
+RAY_PROCESS = ray_process.__file__
 UNUSED = ("monitor", "log_monitor", "dashboard")
 """Programs of Ray that serve nobody in a private session, and slow its start down."""
 
@@ -95,6 +96,7 @@ def look_at_session() -> dict[str, Any]:
             "argument": token in " ".join(commands),
             "servers": sum("raylet" in command for command in commands),
             "unused": [each for each in commands if any(f"{name}.py" in each for name in UNUSED)],
+            "agents": [each for each in commands if "agent" in each.partition(" --")[0] and RAY_PROCESS not in each],
             "modes": [oct(each.stat().st_mode & 0o777) for each in (folder, folder.parent)],
             "loopback_alone": all(ip_address(each.removeprefix("::ffff:")).is_loopback for each in listened_at()),
             "stranger": stranger_at(ray.get_runtime_context().gcs_address),
@@ -146,6 +148,7 @@ def test_a_private_session_is_private_whatever_the_environment_says(scratch: Pat
     assert not found["argument"]
     assert found["logs"] and found["servers"], "that was a session"
     assert found["unused"] == []
+    assert found["agents"] == [], "programs of ours wait in their place"
     assert found["modes"] == ["0o700", "0o700"]
     assert found["loopback_alone"]
     assert found["stranger"].startswith("1  ") and "AuthenticationError" in found["stranger"]
@@ -369,3 +372,84 @@ def test_a_session_that_does_not_come_up_at_first_is_started_again_and_leaves_no
         assert len(list(sessions.iterdir())) == 1
     assert "timed out during startup.); starting it again" in caplog.text
     assert list(sessions.iterdir()) == []
+
+
+def test_a_second_attempt_starts_the_programs_of_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ray._private import services
+
+    own, starts = services.start_ray_process, []
+
+    def fail(**settings: object) -> None:
+        starts.append(services.start_ray_process)
+        raise RuntimeError("another version of Ray")
+
+    monkeypatch.setattr("ray.init", fail)
+    with pytest.raises(WorkerError), ray_session(1):
+        pass
+    assert [start is own for start in starts] == [False, True]
+    assert services.start_ray_process is own
+
+
+def test_only_the_raylets_programs_are_replaced(tmp_path: Path) -> None:
+    from ray._private.services import RAY_PATH
+
+    worker, agent = f"{RAY_PATH}/{session._REPLACED[0]}", f"{RAY_PATH}/{session._REPLACED[1]}"
+    raylet = [
+        "raylet",
+        f"--session_dir={tmp_path}",
+        f"--node_id={'0' * 56}",
+        f"--python_worker_command=python {worker} -v",
+    ]
+    raylet += [f"--dashboard_agent_command=python -u {agent} --minimal", "--head"]
+
+    def start(command: list[str], process_type: str, **settings: object) -> list[str]:
+        return command
+
+    assert session._start_lean(start, ["gcs_server"], "gcs_server") == ["gcs_server"]
+    started = session._start_lean(start, raylet, "raylet")
+    assert started[3:] == [
+        f"--python_worker_command=python {RAY_PROCESS} {worker} -v",
+        f"--dashboard_agent_command=python -u {RAY_PROCESS} {agent} --minimal",
+        "--head",
+    ]
+    assert {file.name.removesuffix(f"_{'0' * 56}") for file in tmp_path.iterdir()} == {
+        *session._PORTS,
+        *session._NO_PORT,
+    }
+
+
+def test_a_ray_process_in_place_of_an_agent_ends_with_its_raylet() -> None:
+    """A shell stands for the raylet here, and is killed."""
+    program = f"export RAY_RAYLET_PID=$$; '{sys.executable}' '{RAY_PROCESS}' /ray/dashboard/agent.py & echo $!; wait"
+    with subprocess.Popen(["sh", "-c", program], stdout=subprocess.PIPE, text=True) as raylet:
+        assert raylet.stdout is not None
+        agent = psutil.Process(int(raylet.stdout.readline()))
+        with pytest.raises(psutil.TimeoutExpired):
+            agent.wait(timeout=0.5)
+        raylet.kill()
+        agent.wait(timeout=100)
+
+
+def test_a_ray_process_in_place_of_a_worker_runs_rays_program_without_slow_imports(tmp_path: Path) -> None:
+    """Ray and what it imports are made up here."""
+    for name in ray_process.SLOW:
+        (tmp_path / f"{name}.py").touch()
+    (tmp_path / "ray.py").write_text(
+        "import importlib\n"
+        "def there(name):\n"
+        "    try: return bool(importlib.import_module(name))\n"
+        "    except ImportError: return False\n"
+        f"found = [name for name in {ray_process.SLOW} if there(name)]\n"
+    )
+    worker = tmp_path / "workers" / ray_process.WORKER
+    worker.parent.mkdir()
+    worker.write_text("import ray, sys; print(__name__, sys.argv, sys.path[0], ray.found, ray.there('uri_template'))")
+    done = subprocess.run(
+        [sys.executable, RAY_PROCESS, worker, "--node"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.stderr == ""
+    assert done.stdout.strip() == f"__main__ {[str(worker), '--node']} {worker.parent} [] True"
