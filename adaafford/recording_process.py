@@ -6,9 +6,9 @@ scan as an NPZ; a line on standard error says which scan it is, or what is wrong
 definitions of their types, not by those that a recording brings.
 """
 
-import errno
 import io
 import math
+import re
 import resource
 import sys
 from collections.abc import Iterator
@@ -48,6 +48,7 @@ MAX_TOPICS, MAX_IMAGES = 1000, 32
 """Topics, and topics of images whose encoding is looked at."""
 SECOND = 10**9
 """Recordings count nanoseconds."""
+_WHOLE_FILES = re.compile(rb"compression_mode:\s*['\"]?file", re.IGNORECASE)
 _GROWTH = 8
 """Of the time that is looked through, backwards from its end, until a message is found."""
 
@@ -149,13 +150,14 @@ def scan_of(path: Path, selection: Selection) -> tuple[bytes, str]:
         Exception: of the library, where a recording is damaged.
     """
     if path.is_dir():
-        read_bounded(path / METADATA, MAX_METADATA_BYTES)
+        if _WHOLE_FILES.search(read_bounded(path / METADATA, MAX_METADATA_BYTES)):
+            raise UsageError("its files are compressed as a whole; unpack one by `zstd -d`, and name that file")
     elif set("?#%") & set(str(path)) and path.suffix == ".db3":
         raise UsageError("the path of an SQLite file must not have ?, # or %; move or rename it")
     with Reader(path) as reader:
         columns, line = _Recording(reader, selection).scan()
     held = io.BytesIO()
-    with np.errstate(over="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         narrow = {name: np.asarray(values, np.float32) for name, values in columns.items()}
     np.savez(held, allow_pickle=False, **narrow)
     return held.getvalue(), line
@@ -192,8 +194,6 @@ def main() -> int:
         line = str(error)
     except OSError as error:
         line = f"cannot be read ({error.strerror})"
-        if error.errno == errno.EFBIG:
-            line = "its files are compressed as a whole; unpack one by `zstd -d`, and name that file"
     except Exception as error:  # noqa: BLE001 - whatever a reader makes of a file from outside.
         line = f"is damaged, cut off, or no recording of ROS 2 ({error or type(error).__name__}); record it again"
     sys.stdout.buffer.write(data)

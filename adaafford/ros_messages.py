@@ -25,6 +25,8 @@ CLOUD, IMAGE, CAMERA_INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imag
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _DEPTH_TYPES = {"16UC1": "u2", "32FC1": "f4"}
 """By the encoding of depth images (REP 118): millimetres, and metres."""
+_SILENT = np.errstate(invalid="ignore", over="ignore")
+"""NumPy warns where it meets certain bits of NaN, and where a number becomes infinite."""
 _POINT_TYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 """Of the fields of a cloud, in the order of their numbers."""
 
@@ -124,6 +126,7 @@ def seconds(stamp: Stamp) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
+@_SILENT
 def cloud_scan(message: PointCloud2, frame: str | None = None, pose: Float | None = None) -> Columns:
     """The points of a cloud, with its normals and marks where it has them, and what is known of its camera.
 
@@ -150,6 +153,7 @@ def cloud_scan(message: PointCloud2, frame: str | None = None, pose: Float | Non
     return _placed(columns, frame or message.header.frame_id, pose)
 
 
+@_SILENT
 def depth_scan(
     message: Image, info: CameraInfo, rectified: bool, frame: str | None = None, pose: Float | None = None
 ) -> Columns:
@@ -252,11 +256,10 @@ def _placed(columns: Columns, frame: str, pose: Float | None) -> Columns:
     found = dict(columns)
     if pose is not None:
         points = np.asarray(columns["points"], np.float64)
-        with np.errstate(invalid="ignore", over="ignore"):
-            # Points that were not measured stay 0 0 0.
-            found["points"] = (points @ pose[:3, :3].T + pose[:3, 3]) * points.any(axis=1, keepdims=True)
-            if "normals" in columns:
-                found["normals"] = np.asarray(columns["normals"], np.float64) @ pose[:3, :3].T
+        # Points that were not measured stay 0 0 0.
+        found["points"] = (points @ pose[:3, :3].T + pose[:3, 3]) * points.any(axis=1, keepdims=True)
+        if "normals" in columns:
+            found["normals"] = np.asarray(columns["normals"], np.float64) @ pose[:3, :3].T
         found["camera"] = pose[:3, 3]
     if frame.endswith(("_optical", "_optical_frame")):
         found["up"] = np.array(CAMERA_UP)

@@ -97,7 +97,7 @@ class Messages:
         writer = Writer(folder, version=9, storage_plugin=plugin)
         if packing in ("file", "message"):
             writer.set_compression(CompressionMode[packing.upper()], CompressionFormat.ZSTD)
-        elif packing == "zstd":
+        elif packing in ("zstd", "bomb"):
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         with writer:
             held: Any = writer.storage
@@ -105,7 +105,8 @@ class Messages:
                 held.compression, held.compressor = "lz4", lz4.frame.compress
             elif packing == "bomb":
                 # A frame of zeros that follows itself again and again.
-                held.compression, held.compressor = "lz4", lambda data: lz4.frame.compress(bytes(64 << 20)) * 100
+                packed = held.compressor(bytes(64 << 20))
+                held.compressor = lambda data: packed * 100
             connections = {}
             for topic, seconds, message in said:
                 kind = message.__msgtype__
