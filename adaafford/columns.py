@@ -15,7 +15,7 @@ from shared.io.text import plain
 from shared.types import Float
 
 Columns = dict[str, NDArray[np.generic]]
-"""Of a file: "points" [M, 3], and where it has them "normals" [M, 3], "movable" [M] and "camera" [3]."""
+"""Of a file: "points" [M, 3], and where it has them "normals" [M, 3], "movable" [M], "camera" [3] and "up" [3]."""
 
 MAX_SCAN_BYTES = 128 << 20
 """Of a file, and of what is packed in it."""

@@ -58,13 +58,16 @@ class Lens(StrictModel):
         """Against gravity, where the camera's own frame suggests it."""
         return CAMERA_UP if self.pose is None else None
 
-    def points(self, depths: Float) -> Float:
+    def points(self, image: NDArray[np.generic]) -> Float:
         """The places that a depth image shows, [H * W, 3], row by row; 0 0 0 where nothing was measured.
 
         Args:
-            depths: [H, W], m, along the optical axis.
+            image: [H, W], along the optical axis: floating-point numbers are metres, whole numbers millimetres.
         """
         fx, fy, cx, cy = self.intrinsics
+        with np.errstate(invalid="ignore", over="ignore"):
+            depths = image.astype(np.float64) * (1.0 if image.dtype.kind == "f" else 0.001)
+            depths[~((depths > 0) & (depths < MAX_COORDINATE))] = 0.0
         rows, columns = np.indices(depths.shape)
         places = np.stack([(columns - cx) / fx * depths, (rows - cy) / fy * depths, depths], axis=-1).reshape(-1, 3)
         measured = depths.ravel() > 0
@@ -99,11 +102,7 @@ def parse_depth(data: bytes, path: Path, lens: Lens, *, raw: bool) -> Scan:
         raise UsageError(f"{path}: --intrinsics is for depth images ({', '.join(DEPTH_SUFFIXES)})") from None
     except ValueError as error:
         raise UsageError(f"{path}: not readable as a depth image ({error}); export it again") from None
-    scale = 1.0 if depths.dtype.kind == "f" else 0.001
-    with np.errstate(invalid="ignore", over="ignore"):
-        metres = depths.astype(np.float64) * scale
-        metres[~((metres > 0) & (metres < MAX_COORDINATE))] = 0.0
-    return checked_scan(lens.points(metres), camera=lens.camera, source=str(path), raw=raw)
+    return checked_scan(lens.points(depths), camera=lens.camera, source=str(path), raw=raw, up=lens.up)
 
 
 def _png(data: bytes) -> NDArray[np.generic]:

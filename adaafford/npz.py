@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from adaafford.columns import MAX_SCAN_BYTES, Columns, shown
 
-_NAMES = ("points", "normals", "movable", "camera")
+_NAMES = ("points", "normals", "movable", "camera", "up")
 _MAX_ENTRIES = 4096
 _DAMAGED: tuple[type[Exception], ...] = (
     *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, MemoryError, OSError, EOFError),

@@ -24,6 +24,7 @@ from adaafford.columns import MAX_SCAN_BYTES, shown, without_mark
 from adaafford.npz import read_npz
 from adaafford.pcd import read_pcd
 from adaafford.ply import read_ply
+from adaafford.recordings import WHOLE, Selection, is_recording, take_scan
 from shared import seeds
 from shared.config import CameraConfig, StrictModel, parse
 from shared.errors import UsageError
@@ -61,6 +62,8 @@ MAX_COORDINATE = 1e4
 """Of places, metres, and of the numbers of a normal."""
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
+DEFAULT_UP: Vector = (0.0, 0.0, 1.0)
+"""Of the frame of a robot's base."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +75,7 @@ class Scan:
         normals: [M, 3], of any length and sign; 0 0 0 for a normal that is estimated; None: all are estimated.
         movable: [M], whether the policy may act on the point; None: everywhere.
         camera: camera position, if the file has it.
+        up: against gravity, if the file or the kind of the camera says it.
         rows: [M], where the points stand in the file or array; None: there are no others.
         missing: how many points were not measured.
     """
@@ -80,6 +84,7 @@ class Scan:
     normals: Float | None = None
     movable: NDArray[np.bool_] | None = None
     camera: Vector | None = None
+    up: Vector | None = None
     rows: NDArray[np.int64] | None = None
     missing: int = 0
 
@@ -87,7 +92,7 @@ class Scan:
 class ScanFrame(StrictModel):
     """The transformation between the scans of one object and the world."""
 
-    up: Vector = (0.0, 0.0, 1.0)
+    up: Vector = DEFAULT_UP
     """Against gravity, of any length."""
     camera: Vector = (0.0, 0.0, 0.0)
     """Where the camera stood, metres."""
@@ -102,15 +107,21 @@ class ScanFrame(StrictModel):
         return up
 
     @classmethod
-    def around(cls, scan: Scan, up: Vector = (0.0, 0.0, 1.0), camera: Vector | None = None) -> "ScanFrame":
+    def around(cls, scan: Scan, up: Vector | None = None, camera: Vector | None = None) -> "ScanFrame":
         """The frame of a first scan: the object's middle is that of its bounding box, as in training.
+
+        Args:
+            scan: the first of an object.
+            up: against gravity; default: the scan's, otherwise 0 0 1.
+            camera: its position; default: the scan's, otherwise 0 0 0.
 
         Raises:
             UsageError: `up` is no direction, or a number is not finite or too large.
         """
         low, high = scan.points.min(axis=0), scan.points.max(axis=0)
         origin = tuple(float(value) for value in (low + high) / 2)
-        told = {"up": up, "camera": camera or scan.camera or (0.0, 0.0, 0.0), "origin": origin}
+        up, camera = up or scan.up or DEFAULT_UP, camera or scan.camera or (0.0, 0.0, 0.0)
+        told = {"up": up, "camera": camera, "origin": origin}
         return parse(cls, told, "the frame of the scans")
 
     @property
@@ -150,17 +161,25 @@ class ScanFrame(StrictModel):
         return found
 
 
-def read_scan(path: Path) -> Scan:
-    """Read a cloud from a PLY, NPZ or PCD file.
+def read_scan(path: Path, selection: Selection = WHOLE) -> Scan:
+    """Read a cloud from a PLY, NPZ or PCD file, or a scan out of a recording of ROS 2.
 
     PLY and PCD: x y z, and optionally normals (nx ny nz or normal_x ...) and `movable`. NPZ: `points`, and
     optionally `normals`, `movable` and `camera`. Points that are 0 0 0 or not finite were not measured: they are left
     out. Normals of this kind are estimated.
 
+    Args:
+        path: of the file, or of the folder of a recording.
+        selection: which scan of a recording.
+
     Raises:
         UsageError: the file has another format, or no cloud of finite points in metres.
         StoreError: the file cannot be read, or is too large.
     """
+    if is_recording(path):
+        return parse_scan(take_scan(path, selection)[0], path, kind=".npz")
+    if selection != WHOLE:
+        raise UsageError(f"{path}: is no recording; leave out --topic, --at and --frame")
     return parse_scan(read_scan_file(path), path)
 
 
@@ -176,20 +195,34 @@ def read_scan_file(path: Path) -> bytes:
 
 
 @_SILENT
-def parse_scan(data: bytes, path: Path, *, raw: bool = False) -> Scan:
-    """A cloud, of an object alone unless it is raw, from the bytes of its file; raises as `read_scan` does."""
+def parse_scan(data: bytes, path: Path, *, raw: bool = False, kind: str | None = None) -> Scan:
+    """A cloud from the bytes of its file; raises as `read_scan` does.
+
+    Args:
+        data: of the file.
+        path: its name.
+        raw: whether the surroundings of the object are in it.
+        kind: of `READERS`; None: as the name ends.
+    """
+    kind = kind or path.suffix.lower()
     if not data:
         raise UsageError(f"{path}: is empty; export it again")
-    if path.suffix.lower() not in READERS:
+    if kind not in READERS:
         raise UsageError(
             f"{path}: a depth image needs the camera's --intrinsics FX FY CX CY; clouds are {', '.join(READERS)}"
         )
     try:
-        columns = READERS[path.suffix.lower()](without_mark(data))
+        columns = READERS[kind](without_mark(data))
     except ValueError as error:
-        raise UsageError(f"{path}: not readable as {path.suffix[1:].upper()} ({error}); export it again") from None
+        raise UsageError(f"{path}: not readable as {kind[1:].upper()} ({error}); export it again") from None
     return checked_scan(
-        columns.get("points"), columns.get("normals"), columns.get("movable"), columns.get("camera"), str(path), raw=raw
+        columns.get("points"),
+        columns.get("normals"),
+        columns.get("movable"),
+        columns.get("camera"),
+        str(path),
+        raw=raw,
+        up=columns.get("up"),
     )
 
 
@@ -202,6 +235,7 @@ def checked_scan(
     source: str = "the cloud",
     *,
     raw: bool = False,
+    up: ArrayLike | None = None,
 ) -> Scan:
     """A scan from untrusted arrays.
 
@@ -212,6 +246,7 @@ def checked_scan(
         camera: [3].
         source: its name in messages.
         raw: whether the surroundings of the object are in it.
+        up: [3], against gravity.
 
     Raises:
         UsageError: shapes do not agree, or values are none that are allowed, or too few or too many points are left,
@@ -220,14 +255,12 @@ def checked_scan(
     places = _array(points, "points", source)
     facing = None if normals is None else _array(normals, "normals", source)
     allowed = None if movable is None else _array(movable, "movable", source)
-    stood = None if camera is None else _array(camera, "camera", source)
+    stood, against = (_vector(value, name, source) for name, value in (("a camera", camera), ("a direction up", up)))
     if places.ndim != 2 or places.shape[1] != 3:
         raise UsageError(f"{source}: needs points of shape [M, 3]; given {places.shape}")
     for name, value, shape in (("normals", facing, places.shape), ("movable", allowed, places.shape[:1])):
         if value is not None and value.shape != shape:
             raise UsageError(f"{source}: needs {name} of shape {shape}, like its points; given {value.shape}")
-    if stood is not None and (stood.shape != (3,) or not _reasonable(stood[None])[0]):
-        raise UsageError(f"{source}: needs a camera of three numbers, metres")
     if len(places) > MAX_ROWS:
         raise UsageError(f"{source}: holds {len(places)} points; give at most {MAX_ROWS}, measured or not")
     rows = np.flatnonzero(_reasonable(places) & places.any(axis=1))
@@ -245,7 +278,8 @@ def checked_scan(
         measured,
         None if facing is None else _known_normals(facing[rows]),
         None if allowed is None else _mask(allowed[rows], source),
-        None if stood is None else (float(stood[0]), float(stood[1]), float(stood[2])),
+        stood,
+        against,
         None if len(rows) == len(places) else rows,
         len(places) - len(rows),
     )
@@ -330,8 +364,9 @@ def npz_of(scan: Scan) -> bytes:
         arrays["normals"] = in_rows(_narrow(scan.normals))
     if scan.movable is not None:
         arrays["movable"] = in_rows(scan.movable)
-    if scan.camera is not None:
-        arrays["camera"] = np.array(scan.camera)
+    for name, vector in (("camera", scan.camera), ("up", scan.up)):
+        if vector is not None:
+            arrays[name] = np.array(vector)
     held = io.BytesIO()
     np.savez_compressed(held, allow_pickle=False, **arrays)
     return held.getvalue()
@@ -397,6 +432,16 @@ def _array(given: ArrayLike | None, name: str, source: str) -> NDArray[np.generi
     if array.dtype.kind not in "biuf":
         raise UsageError(f"{source}: needs {name} of numbers; given {shown([str(array.dtype)])}")
     return array
+
+
+def _vector(given: ArrayLike | None, name: str, source: str) -> Vector | None:
+    """Three numbers, if they are given."""
+    if given is None:
+        return None
+    vector = _array(given, name, source)
+    if vector.shape != (3,) or not _reasonable(vector[None])[0]:
+        raise UsageError(f"{source}: needs {name} of three numbers")
+    return float(vector[0]), float(vector[1]), float(vector[2])
 
 
 def _reasonable(vectors: NDArray[np.generic]) -> NDArray[np.bool_]:

@@ -20,7 +20,9 @@ from adaafford.depth_images import Lens, parse_depth
 from adaafford.heatmaps import heatmap_writer, write_heatmap
 from adaafford.histories import History, ScanName, TriedOutcome, parse_json, read_history, scan_name, write_history
 from adaafford.parts import PARTS_SUFFIX, CutOut, FollowedPart, PartAnswer, PartFinder, part_choice
+from adaafford.recordings import MAX_AT, WHOLE, Selection, is_recording, take_scan
 from adaafford.scans import (
+    DEFAULT_UP,
     POINTS,
     Scan,
     ScanFrame,
@@ -36,6 +38,7 @@ from shared.arms.arm import Arm
 from shared.arms.reach import ArmReach, reachable_points
 from shared.config import StrictModel
 from shared.errors import UsageError
+from shared.io.files import create_exclusively
 from shared.io.text import plain
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
@@ -145,6 +148,8 @@ class Request(StrictModel):
     """The outcome of the last proposal; None if it was not executed."""
     interaction: int | None = Field(None, ge=1)
     """Number of the interaction that the outcome is of; None: the last proposal."""
+    at: float | None = Field(None, ge=0, le=MAX_AT)
+    """Of a recording: seconds after its beginning; None: as --at says."""
     health: bool = False
     """Whether the line asks for `Health` alone."""
 
@@ -184,6 +189,7 @@ class Session:
         part: which part of raw scans is acted on (see `PartChoice.of`); default: the history's, and without one, scans
             are of the object alone.
         lens: of the camera, if scans are depth images; default: the history's.
+        selection: which scans of recordings are taken.
     """
 
     def __init__(
@@ -200,6 +206,7 @@ class Session:
         base: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
         part: str | None = None,
         lens: Lens | None = None,
+        selection: Selection = WHOLE,
     ) -> None:
         policy.require("prior", "aap", "aip")
         self._choice = None if part is None else part_choice(part)
@@ -209,7 +216,7 @@ class Session:
         self._adapter = Adapter(policy)
         self._files, self._budget, self._seed, self._points = files, budget, seed, points
         self._up, self._camera, self._lens, self._tell = up, camera, lens, tell
-        self._arm, self._base = arm, base
+        self._arm, self._base, self._selection = arm, base, selection
         self._primitive = None if arm is None else PRIMITIVES.get(task_named(policy.task).primitive)
         self._seen: dict[tuple[str, ScanFrame, FollowedPart | None], _Seen] = {}
         self._steps = self._tries = 0
@@ -220,7 +227,13 @@ class Session:
         """That the session lives, and how long its last step took."""
         return Health(steps=self._steps, tries=self._tries, last=self._seconds)
 
-    def step(self, cloud: Path, outcome: TriedOutcome | None = None, interaction: int | None = None) -> Step:
+    def step(
+        self,
+        cloud: Path,
+        outcome: TriedOutcome | None = None,
+        interaction: int | None = None,
+        at: float | None = None,
+    ) -> Step:
         """Read a scan and the last outcome, and propose the next action.
 
         A step that is repeated gives the same answer, and its outcome is counted once.
@@ -230,11 +243,16 @@ class Session:
             outcome: of the last proposal; None if it was not executed.
             interaction: number of the interaction that the outcome is of (`Step.interaction`); None: the last proposal,
                 unless the same outcome was told with the same scan before.
+            at: of a recording: seconds after its beginning; None: as the session's selection says.
 
         Raises:
             UsageError: a file cannot be used, with the reason.
         """
         begun = time.perf_counter()
+        if is_recording(cloud):
+            cloud = self._taken_out(cloud, at)
+        elif at is not None or self._selection != WHOLE:
+            raise UsageError(f"{cloud}: is no recording; leave out --topic, --at and --frame")
         name = self._name_of(cloud)
         history = self._history(name)
         if outcome is not None and not self._is_told(history, outcome, interaction, name):
@@ -347,7 +365,7 @@ class Session:
             )
         path, data, sha256 = self._file(name)
         scan = self._parsed(data, path, self._choice, self._lens)
-        up = self._up or (self._lens.up if self._lens else None) or (0.0, 0.0, 1.0)
+        up = self._up or scan.up or DEFAULT_UP
         cut = None
         if self._choice is not None:
             camera = self._camera or scan.camera or (0.0, 0.0, 0.0)
@@ -373,6 +391,20 @@ class Session:
                 f"{self._files.history}: was begun {which}; leave --part as it was, or begin another history"
             )
         return history.model_copy(update={"part": self._choice, "interactions": ()})
+
+    def _taken_out(self, recording: Path, at: float | None) -> Path:
+        """A scan of a recording, as a file beside the history; the same scan always has the same name."""
+        if self._lens is not None:
+            raise UsageError(f"{recording}: has the intrinsics of its cameras; leave out --intrinsics and --pose")
+        selection = self._selection if at is None else self._selection.model_copy(update={"at": at})
+        data, line = take_scan(recording, selection)
+        cloud = self._files.history.parent / f"{recording.stem}-{hashlib.sha256(data).hexdigest()[:12]}.npz"
+        try:
+            if create_exclusively(cloud, data):
+                self._tell(f"{recording}: {line}, is now {cloud}")
+        except OSError as error:
+            raise UsageError(f"{cloud}: cannot be written ({error.strerror}); put the history elsewhere") from None
+        return cloud
 
     def _name_of(self, cloud: Path) -> str:
         """How a history in its folder names the cloud."""

@@ -8,6 +8,7 @@ from shared.errors import UsageError
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "collect": ("sapien", "embreex", "coacd", "defusedxml", "ray"),
     "arm": ("defusedxml",),
+    "ros": ("rosbags",),
     "report": ("matplotlib", "plotly", "jinja2"),
     "video": ("av",),
     "view": ("viser", "websockets"),

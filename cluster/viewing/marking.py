@@ -3,7 +3,7 @@
 Shapes: M points of the scan, W working points: all of them, or an even sample of a large scan.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -139,8 +139,7 @@ class Marking:
         if not self.movable.any():
             raise UsageError("no point is marked as movable; click on the part to act on")
         movable = self.movable if len(self.points) == len(self.scan.points) else self._of_all()
-        scan = self.scan
-        return Scan(scan.points, scan.normals, movable, scan.camera, scan.rows, scan.missing)
+        return replace(self.scan, movable=movable)
 
     def save(self, path: Path, *, overwrite: bool) -> int:
         """Write the scan with the marks as NPZ, each point in its row; returns how many points are movable.

@@ -1,5 +1,6 @@
 """The part of a raw scan: chosen in several ways, kept in the history, and followed where it moves."""
 
+import io
 import json
 from pathlib import Path
 
@@ -162,6 +163,27 @@ def test_the_command_says_which_part(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert json.loads(capsys.readouterr().out)["part"]["chosen"]["confidence"] == 0.9
     assert adaafford(["adapt", *flags, "--part", "none"]) == 2
     assert "give auto, a number" in capsys.readouterr().err
+
+
+def test_a_command_that_goes_on_follows_the_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = write(tmp_path / "scan-1.npz", room())
+    write(tmp_path / "scan-2.npz", room(right=0.7))
+    write(tmp_path / "empty.npz", room(left=3.0, right=3.0))
+    lines = (
+        b'{"cloud": "scan-2.npz", "outcome": {"motion": 0.2}, "interaction": 1}\n',
+        b'{"cloud": "empty.npz", "outcome": {"motion": 0.1}, "interaction": 2}\n',
+        b'{"cloud": "scan-2.npz"}\n',
+    )
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"".join(lines))))
+    flags = ["--cloud", str(scan), "--history", str(tmp_path / "h.json"), "--policy", "pull-closed-door"]
+    assert adaafford(["adapt", *flags, "--part", "2", "--follow"]) == 0
+    first, second, lost, again = map(json.loads, capsys.readouterr().out.splitlines())
+    assert [step["part"]["chosen"]["centre"][0] for step in (first, second)] == pytest.approx([0.91, 0.71], abs=0.02)
+    assert all(step["part"]["chosen"]["centre"][1] < 0 and step["point"][1] < 0 for step in (first, second))
+    assert list(lost) == ["error"] and "no turning part is found" in lost["error"]
+    assert {**again, "seconds": 0} == {**second, "seconds": 0}, "the refused line left the history as it was"
 
 
 def test_doors_side_by_side_come_apart_and_stray_votes_do_not_count() -> None:

@@ -52,27 +52,29 @@ def test_a_command_whose_extra_is_missing_says_how_to_get_it(
     assert capsys.readouterr() == ("", f"adaafford: {line}\n")
 
 
-def core_packages() -> list[str]:
-    """Names of what `pip install adaafford` brings, all the way down."""
-    waiting, seen = ["adaafford"], set[str]()
+def robot_packages(python: str) -> list[str]:
+    """Names of what `pip install 'adaafford[ros]'` brings, all the way down."""
+    waiting, seen, where = ["adaafford"], set[str](), {"extra": "", "python_version": python}
     while waiting:
         name = canonicalize_name(waiting.pop())
         if name in seen or name.startswith(("nvidia-", "cuda-")) or name == "triton":
             continue
         seen.add(name)
         try:
-            needs = PROJECT["dependencies"] if name == "adaafford" else requires(name)
+            ours = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["ros"]]
+            needs = ours if name == "adaafford" else requires(name)
         except PackageNotFoundError:
             continue  # Of another platform or Python.
         requirements = [Requirement(line) for line in needs or ()]
-        waiting.extend(need.name for need in requirements if not need.marker or need.marker.evaluate({"extra": ""}))
+        waiting.extend(need.name for need in requirements if not need.marker or need.marker.evaluate(where))
     return sorted(seen - {"adaafford"})
 
 
-def pinned() -> dict[str, str]:
-    """The lines of the constraints by name."""
+def pinned(python: str) -> dict[str, str]:
+    """The versions of the constraints by name."""
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and not line.startswith("#")]
-    return {canonicalize_name(Requirement(line).name): line for line in lines}
+    pins = [pin for pin in map(Requirement, lines) if not pin.marker or pin.marker.evaluate({"python_version": python})]
+    return {canonicalize_name(pin.name): f"{pin.name}{pin.specifier}" for pin in pins}
 
 
 def without_wheels(requirements: list[str], python: str, machine: str, folder: Path) -> str:
@@ -104,18 +106,18 @@ def skip_without_index(said: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("python", PYTHONS)
 def test_every_pinned_dependency_has_a_wheel(python: str, tmp_path: Path) -> None:
-    said = without_wheels(list(pinned().values()), python, "x86_64", tmp_path)
+    said = without_wheels(list(pinned(python).values()), python, "x86_64", tmp_path)
     skip_without_index(said)
     assert said == ""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("python", (PYTHONS[0], PYTHONS[-1]))
-def test_the_core_has_wheels_for_aarch64(python: str, tmp_path: Path) -> None:
-    core = core_packages()
-    assert {"torch", "numba", "zarr"} <= set(core)
-    assert not {"ray", "sapien", "plotly"} & set(core)
-    said = without_wheels([pinned().get(name, name) for name in core], python, "aarch64", tmp_path)
+def test_what_a_robot_needs_has_wheels_for_aarch64(python: str, tmp_path: Path) -> None:
+    needed, pins = robot_packages(python), pinned(python)
+    assert {"torch", "numba", "zarr", "rosbags"} <= set(needed)
+    assert not {"ray", "sapien", "plotly"} & set(needed)
+    said = without_wheels([pins.get(name, name) for name in needed], python, "aarch64", tmp_path)
     skip_without_index(said)
     assert said == ""
 

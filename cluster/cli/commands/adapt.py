@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, BinaryIO
 
+import tyro
 from pydantic import Field
 
+from adaafford.recordings import WHOLE, Selection
 from cluster.config.flags import parse_flags
 from shared.errors import AdaAffordError, UsageError
 from shared.io.text import plain
@@ -35,7 +37,8 @@ class AdaptCommand:
 
     cloud: Path
     """A scan of the object in its present state (.ply, .npz or .pcd): metres, only the object unless --part is given.
-    Or a depth image (.png of 16 bits in mm; .npy, or .npz with `depth`, in metres) with --intrinsics."""
+    Or a depth image (.png of 16 bits in mm; .npy, or .npz with `depth`, in metres) with --intrinsics. Or a recording of
+    ROS 2 (.mcap, .db3 or the folder), whose last scan is taken."""
     history: Path
     """The interactions so far (JSON), created if missing. Scans are in the same folder or below."""
     policy: str | None = None
@@ -68,6 +71,7 @@ class AdaptCommand:
     pose: tuple[float, float, float, float, float, float, float] | None = None
     """Where that camera stands: x y z in metres and its rotation as a quaternion x y z w, in the frame of the answers.
     Default: answers are in its own frame (x right, y down, z forward), and up is 0 -1 0."""
+    recorded: Annotated[Selection, tyro.conf.arg(name="")] = WHOLE
     budget: int = 4
     """The most interactions that are proposed before the final action."""
     points: int = 2048
@@ -131,6 +135,7 @@ def main(args: list[str]) -> int:
         base=command.base,
         part=command.part,
         lens=lens,
+        selection=command.recorded,
     )
     told = {
         "motion": command.outcome,
@@ -182,6 +187,6 @@ def _follow(session: "Session", folder: Path) -> None:
         request = Request.read(line)
         if request.health:
             return session.health.model_dump_json()
-        return session.step(folder / request.cloud, request.outcome, request.interaction).model_dump_json()
+        return session.step(folder / request.cloud, request.outcome, request.interaction, request.at).model_dump_json()
 
     answer_lines('write {"cloud": "scan.ply"}', answer)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from adaafford.recordings import WHOLE, Selection, is_recording
 from cluster.config.flags import parse_flags
 from shared.errors import UsageError
 from shared.io.text import plain
@@ -33,7 +34,7 @@ class ViewCommand:
     """
 
     target: Annotated[str, tyro.conf.Positional]
-    """A store (folder or s3:// URL), a run, or a scan (.ply, .npz or .pcd)."""
+    """A store (folder or s3:// URL), a run, or a scan (.ply, .npz, .pcd, or a recording of ROS 2: .mcap or .db3)."""
     policy: tuple[str, ...] = ()
     """One or two policies to be shown first, side by side: names of bundled policies, folders, or finished runs.
     Default: the newest policy of the store, if it has one; all of its policies can be chosen in the browser."""
@@ -49,6 +50,7 @@ class ViewCommand:
     """The direction against gravity in a scan's frame; default: 0 0 1."""
     camera: tuple[float, float, float] | None = None
     """The camera position in a scan's frame; default: that of the scan, otherwise 0 0 0."""
+    recorded: Annotated[Selection, tyro.conf.arg(name="")] = WHOLE
 
 
 def main(args: list[str]) -> int:
@@ -89,7 +91,8 @@ def viewing(command: ViewCommand) -> "Iterator[viser.ViserServer]":
 def _is_scan(target: str) -> bool:
     from adaafford.scans import READERS
 
-    return "://" not in target and not Path(target).is_dir() and Path(target).suffix.lower() in READERS
+    path = Path(target)
+    return "://" not in target and (is_recording(path) or (not path.is_dir() and path.suffix.lower() in READERS))
 
 
 def _scan_page(command: ViewCommand) -> "Callable[[viser.ViserServer], object]":
@@ -104,8 +107,8 @@ def _scan_page(command: ViewCommand) -> "Callable[[viser.ViserServer], object]":
         raise UsageError(f"--out {out}: marks are saved as NPZ; give a name that ends with .npz")
     if out.exists() and not command.overwrite:
         raise UsageError(f"{out}: is there already; name another file by --out, or replace it with --overwrite")
-    scan = read_scan(path)
-    frame = ScanFrame.around(scan, command.up or (0.0, 0.0, 1.0), command.camera)
+    scan = read_scan(path, command.recorded)
+    frame = ScanFrame.around(scan, command.up, command.camera)
     if command.up is None and (doubt := doubtful_up(scan, frame)) is not None:
         print(plain(f"{path}: {doubt}; say so by --up"))
     policy = load_policy(command.policy[0]) if command.policy else None
@@ -120,8 +123,10 @@ def _store_page(command: ViewCommand) -> "Callable[[viser.ViserServer], object]"
     from shared.store import Store
     from shared.store.backends.base import folder_beside, is_url
 
-    if command.out is not None or command.overwrite or command.camera is not None or command.up is not None:
-        raise UsageError(f"{command.target}: is no scan; --out, --overwrite, --up and --camera are for scans")
+    for_scans = (command.out, command.camera, command.up)
+    if command.overwrite or command.recorded != WHOLE or any(given is not None for given in for_scans):
+        flags = "--out, --overwrite, --up, --camera, --topic, --at and --frame"
+        raise UsageError(f"{command.target}: is no scan; {flags} are for scans")
     run = None if is_url(command.target) else RunFolder(Path(command.target))
     objects: Path | None
     if run is not None and run.config.is_file():
