@@ -49,8 +49,8 @@ from shared.types import Action, Observation
 
 PURPOSE = "adapt"
 FINAL_SHARE = 0.01
-"""Of the cloud's points, from the best of which the final action is drawn, as in the published code. In rehearsals with
-real objects, 45% of closed doors moved instead of 30% with a point of the best 100, and 85% of faucets instead of 50%."""
+"""Of the cloud's points: the final action is at one of the best, as in the published code. In rehearsals with real
+objects, 45% of closed doors moved instead of 30% with a point of the best 100, and 85% of faucets instead of 50%."""
 SURFACE_POINTS = 10_000
 """Of a scan, about, that the links of an arm must not touch."""
 

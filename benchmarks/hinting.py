@@ -66,6 +66,8 @@ def measure(command: HintSettings) -> dict[str, Any]:
     check_picture("--picture", command.picture)
     if command.store is None:
         fit_for_hints(policy, command.task)
+        if policy.config.pinch_profile:
+            command = command.model_copy(update={"collection": command.collection.keeping_depth()})
     if not (seen := seen_by(command.policy)):
         print(f"--policy {unknown(command.policy)}", file=sys.stderr)
     with stored(command) as store:
