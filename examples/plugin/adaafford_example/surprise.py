@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from learner.data.dataset import Dataset, Split
 from learner.data.features import FrozenFeatures, FrozenPrior
-from learner.data.sampling import draw_numbers, order_rows, spread
+from learner.data.sampling import draw, order_rows, spread
 from learner.settings import TrainingConfig
 from learner.stages.trainers import BaselineTraining, Load, StageTrainer
 from learner.training.data_parallel import share
@@ -69,9 +69,8 @@ class SurpriseStage:
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """Cross entropy on a few rollouts."""
-        train = self.parts.train
-        chosen = draw_numbers(len(train), min(self.config.batch_rollouts, len(train)), rng)
-        loss, rows = self._loss([train[number] for number in chosen], rng, share(len(chosen)))
+        chosen = draw(self.parts.train, self.config.batch_rollouts, rng)
+        loss, rows = self._loss(chosen, rng, share(len(chosen)))
         return StepResult({"critic": loss}, rows)
 
     @torch.no_grad()
