@@ -1,6 +1,6 @@
 """Recordings of ROS 2 (MCAP, SQLite, or a rosbag2 folder of these): one scan is taken out of them, as an NPZ.
 
-Needs `pip install 'adaafford[ros]'`. Recordings are hostile until checked, so another process with bounds opens them
+Needs `pip install 'adaafford[ros]'`. Recordings are untrusted, so another process with bounds opens them
 (`adaafford.recording_process`).
 """
 
@@ -19,11 +19,11 @@ from shared.io.text import plain
 
 SUFFIXES = (".mcap", ".db3")
 METADATA = "metadata.yaml"
-"""Of the folder of a recording."""
+"""The file that makes a folder a recording."""
 MAX_CPU_S, MAX_WAIT_S = 120, 600
 """For one scan. A reader that takes longer has met a file that is made to be slow, or one without an index."""
 MAX_AT = 1e9
-"""s."""
+"""The largest --at, s."""
 _MOST_SAID = 1000
 """Characters of a reason."""
 

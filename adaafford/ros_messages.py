@@ -1,7 +1,7 @@
 """Messages of ROS 2 as clouds and depth images, and proposals as poses: pure functions, without a package of ROS.
 
 A message is any object with the fields of its definition, whether rclpy or a reader of recordings made it. Messages are
-hostile until checked. Every function raises `ValueError` with a reason that a user understands.
+untrusted. Every function raises `ValueError` with a reason that a user understands.
 """
 
 from array import array

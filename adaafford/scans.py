@@ -165,8 +165,8 @@ def read_scan(path: Path, selection: Selection = WHOLE) -> Scan:
     """Read a cloud from a PLY, NPZ or PCD file, or a scan out of a recording of ROS 2.
 
     PLY and PCD: x y z, and optionally normals (nx ny nz or normal_x ...) and `movable`. NPZ: `points`, and
-    optionally `normals`, `movable` and `camera`. Points that are 0 0 0 or not finite were not measured: they are left
-    out. Normals of this kind are estimated.
+    optionally `normals`, `movable`, `camera` and `up`. Points that are 0 0 0 or not finite were not measured: they are
+    left out. Normals of this kind are estimated.
 
     Args:
         path: of the file, or of the folder of a recording.
@@ -396,9 +396,9 @@ class ScannedSurface:
         apart = float(np.median(cKDTree(points).query(asked, k=[_DENSE_NEIGHBOUR + 1])[0]))
         if not apart <= _DENSE_M:
             raise UsageError(
-                f"the policy is told what lies between the fingers, and the points are {apart:.3f} m apart; "
-                "give the scan before it is thinned, with a point every centimetre or closer, or take a policy that is "
-                "not told, such as pull-closed-door-sparse"
+                f"the policy uses the surface between the fingers, and the points are {apart:.3f} m apart; "
+                "give the scan before it is thinned, with a point every centimetre or closer, or take a policy that "
+                "does not use it, such as pull-closed-door-sparse"
             )
         return round_points(self.frame.to_world(points))
 

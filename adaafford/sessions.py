@@ -50,7 +50,7 @@ from shared.types import Action, Observation
 PURPOSE = "adapt"
 FINAL_SHARE = 0.01
 """Of the cloud's points: the final action is at one of the best, as in the published code. In rehearsals with real
-objects, 45% of closed doors moved instead of 30% with a point of the best 100, and 85% of faucets instead of 50%."""
+objects 45% of final actions moved a closed door, and 30% with one of the best 100; faucets 85% and 50%."""
 SURFACE_POINTS = 10_000
 """Of a scan, about, that the links of an arm must not touch."""
 
@@ -401,7 +401,7 @@ class Session:
         cloud = self._files.history.parent / f"{recording.stem}-{hashlib.sha256(data).hexdigest()[:12]}.npz"
         try:
             if create_exclusively(cloud, data):
-                self._tell(f"{recording}: {line}, is now {cloud}")
+                self._tell(f"{recording}: {line}, was written to {cloud}")
         except OSError as error:
             raise UsageError(f"{cloud}: cannot be written ({error.strerror}); put the history elsewhere") from None
         return cloud

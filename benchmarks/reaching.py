@@ -53,8 +53,11 @@ class ReachSettings(BenchSettings):
 
 def measure(command: ReachSettings) -> dict[str, Any]:
     """Measure, and print a summary."""
-    command = command.model_copy(update={"collection": command.collection.model_copy(update={"arm": command.arm})})
     adapter = Adapter(load_policy(command.policy))
+    collection = command.collection.model_copy(update={"arm": command.arm})
+    if adapter.policy.config.pinch_profile:
+        collection = collection.keeping_depth()
+    command = command.model_copy(update={"collection": collection})
     times: dict[str, list[float]] = {name: [] for name in ("check", "step", "step_without_arm", "marks")}
     random = reached = proposed = none_reached = without_reach = wrong = 0
     with planned(command) as (plan, folder):

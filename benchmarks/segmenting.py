@@ -41,7 +41,7 @@ SEEN_POINTS = 150
 """A part of which fewer points are scanned is not asked for."""
 WORST = 8
 POLICIES = {"push-faucet": "push-faucet"}
-"""Bundled policies by task; that for doors for all other tasks."""
+"""Bundled policies by task; `pull-closed-door` for all other tasks."""
 
 
 class SegmentingSettings(BenchSettings):

@@ -33,7 +33,7 @@ def main() -> None:
 
 @contextmanager
 def without_slow_imports() -> Iterator[None]:
-    """Importing any of `SLOW` fails meanwhile, as where they are not installed, unless it is imported already."""
+    """Within this context, imports of `SLOW` fail as if not installed; what is imported already stays."""
     hidden = [name for name in SLOW if name not in sys.modules]
     sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]
     try:
@@ -44,7 +44,7 @@ def without_slow_imports() -> Iterator[None]:
 
 
 def wait_for_raylet() -> None:
-    """Return when the raylet has ended, which started this process, and itself ends as soon as an agent does."""
+    """Wait until the raylet ends, which started this process; it exits as soon as one of its agents does."""
     raylet = int(os.environ["RAY_RAYLET_PID"])
     while os.getppid() == raylet:
         time.sleep(1)

@@ -62,8 +62,8 @@ class AdaptCommand:
     success: bool | None = None
     """Whether the part moved as intended; default: whether it moved by more than 0.01."""
     up: tuple[float, float, float] | None = None
-    """The direction against gravity in the scan's frame; default: the history's, otherwise 0 0 1. A level camera with x
-    right, y down and z forward has 0 -1 0."""
+    """The direction against gravity in the scan's frame; default: that of the history or the scan, otherwise 0 0 1. A
+    level camera with x right, y down and z forward has 0 -1 0."""
     camera: tuple[float, float, float] | None = None
     """The camera position in the scan's frame; default: that of the history or the scan, otherwise 0 0 0."""
     intrinsics: tuple[float, float, float, float] | None = None

@@ -47,7 +47,7 @@ class ViewCommand:
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
     """Replace that file if it is there."""
     up: tuple[float, float, float] | None = None
-    """The direction against gravity in a scan's frame; default: 0 0 1."""
+    """The direction against gravity in a scan's frame; default: that of the scan, otherwise 0 0 1."""
     camera: tuple[float, float, float] | None = None
     """The camera position in a scan's frame; default: that of the scan, otherwise 0 0 0."""
     recorded: Annotated[Selection, tyro.conf.arg(name="")] = WHOLE
