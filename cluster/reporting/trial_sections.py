@@ -30,7 +30,7 @@ class FailedExploit:
 
 def failures_section(trials: Sequence[EvaluationTrial], adapter: Adapter) -> Section:
     """The failures at the greatest budget, one of each kind before any kind comes again."""
-    key, title = "failures", "FailedExploit gallery"
+    key, title = "failures", "Failure gallery"
     last = [(trial, trial.exploits[-1]) for trial in trials if trial.exploits]
     failed = [(trial, row) for trial, row in last if not row.outcome.success]
     counted = f"{len(failed)} of the {len(last)} exploits that were looked at, at the greatest budget, failed."
