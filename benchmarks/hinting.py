@@ -66,8 +66,7 @@ def measure(command: HintSettings) -> dict[str, Any]:
     check_picture("--picture", command.picture)
     if command.store is None:
         fit_for_hints(policy, command.task)
-        if policy.config.pinch_profile:
-            command = command.model_copy(update={"collection": command.collection.keeping_depth()})
+        command = command.model_copy(update={"collection": policy.collection_for(command.collection)})
     if not (seen := seen_by(command.policy)):
         print(f"--policy {unknown(command.policy)}", file=sys.stderr)
     with stored(command) as store:

@@ -54,9 +54,7 @@ class ReachSettings(BenchSettings):
 def measure(command: ReachSettings) -> dict[str, Any]:
     """Measure, and print a summary."""
     adapter = Adapter(load_policy(command.policy))
-    collection = command.collection.model_copy(update={"arm": command.arm})
-    if adapter.policy.config.pinch_profile:
-        collection = collection.keeping_depth()
+    collection = adapter.policy.collection_for(command.collection.model_copy(update={"arm": command.arm}))
     command = command.model_copy(update={"collection": collection})
     times: dict[str, list[float]] = {name: [] for name in ("check", "step", "step_without_arm", "marks")}
     random = reached = proposed = none_reached = without_reach = wrong = 0

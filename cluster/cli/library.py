@@ -94,7 +94,9 @@ def simulated(
     require("adaafford.simulated", "collect", without=("ray",))
     from collector.simulated_objects import SimulatedObjects
 
-    found = SimulatedObjects(Path(objects), task_of(task), CollectionConfig(gripper=gripper, arm=arm))
+    # Like a robot's scans, observations have all that the sensor measured, so any policy can be asked.
+    collection = CollectionConfig(gripper=gripper, arm=arm).keeping_depth()
+    found = SimulatedObjects(Path(objects), task_of(task), collection)
     plan, first = found.plan(seed), 0
     while True:
         start = found.start(plan, first)

@@ -135,7 +135,7 @@ def evaluate_without_run(source: str, settings: EvaluateSettings, out: Path | No
     if not (seen := seen_by(source)):
         Console(file=sys.stderr, highlight=False).print(f"policy {unknown(source)}", markup=False, soft_wrap=True)
     refs, folder = _objects(task, settings, settings.objects, lambda ref: ref.content_hash not in seen)
-    needs_depth, files, collection = policy.config.pinch_profile, policy.to_files(), settings.collection
+    files, collection = policy.to_files(), settings.collection
     if collection.gripper == PANDA:  # The default, which gives way to the hand that the policy knows.
         collection = collection.model_copy(update={"gripper": policy.gripper})
     subject = _Subject(
@@ -143,7 +143,7 @@ def evaluate_without_run(source: str, settings: EvaluateSettings, out: Path | No
         files=lambda version: files,
         version=ONLY_VERSION,
         methods=methods,
-        collection=collection.keeping_depth() if needs_depth else collection,
+        collection=policy.collection_for(collection),
         oracle=place,
         root=None,
         evaluations=EVALUATIONS,

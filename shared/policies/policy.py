@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from shared.config import PANDA, CameraConfig, Name, StrictModel
+from shared.config import PANDA, CameraConfig, CollectionConfig, Name, StrictModel
 from shared.errors import StoreError, UsageError
 from shared.io.documents import parse_document, parse_object
 from shared.io.text import MAX_WORD, plain
@@ -168,6 +168,14 @@ class Policy:
                 "this policy is told what lies between the fingers, and these settings keep no depth images; set "
                 "collection.camera.keep_depth"
             )
+
+    def collection_for(self, collection: CollectionConfig) -> CollectionConfig:
+        """The same settings, with depth images kept if the networks have pinch profiles as input.
+
+        Raises:
+            UsageError: the images are too large for that.
+        """
+        return collection.keeping_depth() if self.config.pinch_profile else collection
 
     def require(self, *names: ModuleName) -> None:
         """Check that modules have been trained.

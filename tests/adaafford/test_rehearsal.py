@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from adaafford.histories import TriedOutcome, read_history
+from adaafford.pretrained import load_policy
 from adaafford.scans import read_scan
 from adaafford.sessions import Session, SessionFiles, Step
 from cluster.cli.library import simulated
@@ -20,6 +21,8 @@ from collector.sim.depth_noise import LEVEL_M, noisy
 from collector.sim.environment import camera_for
 from shared.config import CameraConfig
 from shared.errors import UsageError
+from shared.policies.adaptation import Adapter
+from shared.policies.proposers import ExploitProposer
 from shared.types import OutcomeKind
 from tests.support.small_policies import policy_with_all
 
@@ -220,6 +223,15 @@ def test_bad_input_is_one_line(
     line = capsys.readouterr().err
     assert expected in line
     assert line.count("\n") == 1
+
+
+def test_a_bundled_policy_that_uses_the_surface_between_the_fingers_acts_on_a_simulated_object(objects: Path) -> None:
+    observation = next(simulated(objects, "pull-closed-door", seed=1)).observe()
+    adapter = Adapter(load_policy("pull-closed-door"))
+    assert adapter.policy.config.pinch_profile
+    action = ExploitProposer(adapter, np.random.default_rng(1)).propose(observation, [])
+    assert action is not None
+    assert observation.movable[action.point_index]
 
 
 # The errors of a depth camera.
