@@ -36,13 +36,14 @@ from adaafford.scans import (
 from shared import seeds
 from shared.arms.arm import Arm
 from shared.arms.reach import ArmReach, reachable_points
-from shared.config import StrictModel
+from shared.config import Name, StrictModel
 from shared.errors import UsageError
 from shared.io.files import create_exclusively
 from shared.io.text import plain
 from shared.policies.adaptation import Adapter
+from shared.policies.methods import PROPOSERS
 from shared.policies.policy import Policy
-from shared.policies.proposers import AipProposer, ExploitProposer
+from shared.policies.proposers import AIP_NAME, ExploitProposer, proposer_named
 from shared.primitives import PRIMITIVES
 from shared.tasks import task_named
 from shared.types import Action, Observation
@@ -175,9 +176,9 @@ class Session:
     """One object, from its first scan to the last.
 
     Args:
-        policy: with prior, AAP and AIP trained.
+        policy: with prior and AAP trained, and what the proposer needs.
         files: what is read and written.
-        budget: how many interactions AIP may propose.
+        budget: how many interactions the proposer may propose.
         seed: of the random draws; a repeated step gives the same answer.
         up: direction against gravity, in the frame of the scans; default: the history's, otherwise 0 0 1.
         camera: camera position, in the same frame; default: that of the first scan, otherwise 0 0 0.
@@ -190,6 +191,7 @@ class Session:
             are of the object alone.
         lens: of the camera, if scans are depth images; default: the history's.
         selection: which scans of recordings are taken.
+        proposer: that chooses the interactions, by name.
     """
 
     def __init__(
@@ -207,8 +209,9 @@ class Session:
         part: str | None = None,
         lens: Lens | None = None,
         selection: Selection = WHOLE,
+        proposer: Name = AIP_NAME,
     ) -> None:
-        policy.require("prior", "aap", "aip")
+        policy.require("prior", "aap", *PROPOSERS.get(proposer).modules)
         self._choice = None if part is None else part_choice(part)
         self._task = policy.task
         if files.heatmap is not None:
@@ -216,7 +219,7 @@ class Session:
         self._adapter = Adapter(policy)
         self._files, self._budget, self._seed, self._points = files, budget, seed, points
         self._up, self._camera, self._lens, self._tell = up, camera, lens, tell
-        self._arm, self._base, self._selection = arm, base, selection
+        self._arm, self._base, self._selection, self._proposer = arm, base, selection, proposer
         self._primitive = None if arm is None else PRIMITIVES.get(task_named(policy.task).primitive)
         self._seen: dict[tuple[str, ScanFrame, FollowedPart | None], _Seen] = {}
         self._steps = self._tries = 0
@@ -269,7 +272,9 @@ class Session:
         self._seen = {key: value for key, value in self._seen.items() if id(value) in told}
         read = time.perf_counter()
         rng = seeds.generator(self._seed, PURPOSE, len(known))
-        action = AipProposer(self._adapter, rng, self._budget).propose(observation, known)
+        action = None
+        if len(known) < self._budget:
+            action = proposer_named(self._proposer, self._adapter, rng, self._budget).propose(observation, known)
         do: Literal["try", "act"] = "act" if action is None else "try"
         if action is None:
             action = ExploitProposer(self._adapter, rng, share=FINAL_SHARE).propose(observation, known)

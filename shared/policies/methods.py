@@ -79,7 +79,8 @@ PROPOSERS = Registry(
     ProposerKind,
     {
         "aip": "shared.policies.proposers:AIP",
-        "information-value": "shared.policies.information_value:INFORMATION_VALUE",
+        "information-gain": "shared.policies.imagined_outcomes:INFORMATION_GAIN",
+        "information-value": "shared.policies.imagined_outcomes:INFORMATION_VALUE",
         "fps": "shared.policies.fps:FPS",
         "purefps": "shared.policies.fps:PURE_FPS",
         "argfps": "shared.policies.fps:WEIGHTED_FPS",
@@ -148,6 +149,7 @@ METHODS: Registry[Method] = Registry(
         "ours-fps": Method("fps", "aap"),
         "ours-no-iteration": Method("aip", "aap", version=FIRST_VERSION),
         "ours-final": Method("aip", "aap"),
+        "ours-gain": Method("information-gain", "aap", reference=True),
         "ours-value": Method("information-value", "aap", reference=True),
     },
 )

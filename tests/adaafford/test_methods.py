@@ -19,7 +19,7 @@ from shared.plan import EvaluationConfig
 from shared.policies.adaptation import Adapter, action_from_frame, frames_in_view, movable_points, point_indices
 from shared.policies.critics import Critic, critic_named
 from shared.policies.fps import LEAST_POINTS, THRESHOLD, FpsProposer, actionable_points, distances_to
-from shared.policies.information_value import BEST, CANDIDATES, USUAL_MOTION
+from shared.policies.imagined_outcomes import ASKED, BEST, CANDIDATES, SURE, USUAL_MOTION
 from shared.policies.methods import (
     METHODS,
     BaselineName,
@@ -225,35 +225,51 @@ def test_imagined_interactions_are_read_as_if_they_had_happened(adapter: Adapter
                 np.testing.assert_allclose(believed, adapter.score(observation, actions, after), rtol=1e-4)
 
 
-def test_the_action_with_the_highest_value_of_information_is_proposed(
-    adapter: Adapter, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["information-gain", "information-value"])
+def test_the_action_whose_imagined_outcomes_are_worth_the_most_is_proposed(
+    adapter: Adapter, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    observation, compared = observation_of(), list[list[Action]]()
+    observation, compared, asked = observation_of(), list[list[Action]](), list[list[Action]]()
     history = history_of(observation, 2)
 
-    imagined = Adapter.imagined
+    def actions_of(points: NDArray[np.int64], frames: Tensor) -> list[Action]:
+        return [action_from_frame(observation, int(p), frame) for p, frame in zip(points, frames, strict=True)]
+
+    imagined, beliefs = Adapter.imagined, Adapter.beliefs
 
     def spied(self: Adapter, seen: Observation, points: NDArray[np.int64], frames: Tensor, *rest: Any) -> Tensor:
-        compared.append([action_from_frame(seen, int(p), frame) for p, frame in zip(points, frames, strict=True)])
+        compared.append(actions_of(points, frames))
         return imagined(self, seen, points, frames, *rest)
 
+    def heard(self: Adapter, seen: Observation, points: NDArray[np.int64], frames: Tensor, latents: Tensor) -> Tensor:
+        asked.append(actions_of(points, frames))
+        return beliefs(self, seen, points, frames, latents)
+
     monkeypatch.setattr(Adapter, "imagined", spied)
-    proposed = proposer_named("information-value", adapter, np.random.default_rng(0), 4).propose(observation, history)
+    monkeypatch.setattr(Adapter, "beliefs", heard)
+    proposed = proposer_named(name, adapter, np.random.default_rng(0), 4).propose(observation, history)
     assert proposed is not None
-    actions = compared[0]
+    actions, questions = compared[0], asked[-1]
     assert len({action.point_index for action in actions}) == len(actions)
     assert len(actions) == min(CANDIDATES, len(movable_points(observation)))
+    assert len(questions) == len(actions) * (ASKED if name == "information-gain" else 1)
     motion = float(np.median([i.outcome.motion for i in history if i.outcome.success] or [USUAL_MOTION]))
+    now = adapter.score(observation, questions, history).clip(SURE, 1 - SURE).astype(float)
 
-    def value(action: Action) -> float:
+    def worth(after: list[Interaction]) -> float:
+        believed = adapter.score(observation, questions, after).clip(SURE, 1 - SURE).astype(float)
+        if name == "information-value":
+            return float(np.sort(believed)[-BEST:].mean())
+        moved = believed * np.log(believed / now) + (1 - believed) * np.log((1 - believed) / (1 - now))
+        return float(moved.mean())
+
+    def expected(action: Action) -> float:
         odds = float(adapter.score(observation, [action], history)[0])
-        best = [
-            np.sort(adapter.score(observation, actions, [*history, Interaction(observation, action, outcome)]))[-BEST:]
-            for outcome in (Outcome(OutcomeKind.OK, motion, True), Outcome(OutcomeKind.OK, 0.0, False))
-        ]
-        return float(odds * best[0].mean() + (1 - odds) * best[1].mean())
+        outcomes = Outcome(OutcomeKind.OK, motion, True), Outcome(OutcomeKind.OK, 0.0, False)
+        good, bad = (worth([*history, Interaction(observation, action, outcome)]) for outcome in outcomes)
+        return odds * good + (1 - odds) * bad
 
-    values = [value(action) for action in actions]
+    values = [expected(action) for action in actions]
     chosen = next(k for k, action in enumerate(actions) if action.point_index == proposed.point_index)
     assert values[chosen] == pytest.approx(max(values), abs=1e-5)
 

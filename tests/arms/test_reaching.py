@@ -51,7 +51,7 @@ from tests.support.single_door import door
 from tests.support.small_policies import policy_with_all
 
 PANDA = ARMS.get("panda")
-PROPOSERS = ("aip", "fps", "purefps", "argfps", "information-value", "aap", "where2act")
+PROPOSERS = ("aip", "fps", "purefps", "argfps", "information-gain", "information-value", "aap", "where2act")
 INTO = gripper_rotation(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
 
 

@@ -74,6 +74,9 @@ class AdaptCommand:
     recorded: Annotated[Selection, tyro.conf.arg(name="")] = WHOLE
     budget: int = 4
     """The most interactions that are proposed before the final action."""
+    proposer: str = "aip"
+    """What chooses these interactions: aip, as published; information-gain, which often reveals more and takes a second
+    a step; or another one of docs/evaluation.md."""
     points: int = 2048
     """How many points of a scan the policy receives: as many as in its training (see its model card)."""
     seed: Annotated[int, Field(ge=0)] = 0
@@ -136,6 +139,7 @@ def main(args: list[str]) -> int:
         part=command.part,
         lens=lens,
         selection=command.recorded,
+        proposer=command.proposer,
     )
     told = {
         "motion": command.outcome,

@@ -47,6 +47,8 @@ class RehearseCommand:
     """With --policy: how many objects with freshly drawn hidden dynamics, each in a folder of its own, are tried."""
     budget: int = 4
     """With --policy: the most interactions before the final action."""
+    proposer: str = "aip"
+    """With --policy: what chooses these interactions, as for `adapt`."""
     goal: float | None = None
     """With --policy: go on until the part has moved so far from where it was at first, rad or m."""
     within: int = 6
@@ -161,6 +163,7 @@ def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy")
         arm=None if command.arm is None else arm_of(command.arm),
         base=robot.base or (0.0, 0.0, 0.0, 0.0),
         part=AUTO if command.scene else None,
+        proposer=command.proposer,
     )
 
     def tell(step: "Step", request: "Request") -> None:
