@@ -398,7 +398,7 @@ class ScannedSurface:
             raise UsageError(
                 f"the policy uses the surface between the fingers, and the points are {apart:.3f} m apart; "
                 "give the scan before it is thinned, with a point every centimetre or closer, or take a policy that "
-                "does not use it, such as pull-closed-door-sparse"
+                "does not use it; names of such bundled policies end in -sparse"
             )
         return round_points(self.frame.to_world(points))
 

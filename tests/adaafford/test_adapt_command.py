@@ -249,7 +249,9 @@ def test_a_policy_is_found_by_folder_file_run_or_name(
         load_policy("push")
 
 
-@pytest.mark.parametrize("name", ["pull", "pull-closed-door", "pull-closed-door-sparse", "push", "push-faucet"])
+@pytest.mark.parametrize(
+    "name", ["pull", "pull-closed-door", "pull-closed-door-sparse", "push", "push-faucet", "push-faucet-sparse"]
+)
 def test_the_package_brings_a_policy_with_its_card(name: str) -> None:
     policy = load_policy(name)
     assert (policy.task, policy.trained) == (name.removesuffix("-sparse"), {"prior", "aap", "aip"})
@@ -299,8 +301,9 @@ def test_an_export_leaves_other_files_alone(tmp_path: Path, capsys: pytest.Captu
 # The loop.
 
 
-def test_a_session_fills_its_history_and_then_acts(policy_folder: Path, scan: Path) -> None:
-    live = session(policy_folder, scan, budget=1)
+@pytest.mark.parametrize("proposer", ["aip", "information-gain", "purefps"])
+def test_a_session_fills_its_history_and_then_acts(policy_folder: Path, scan: Path, proposer: str) -> None:
+    live = session(policy_folder, scan, budget=1, proposer=proposer)
     first = live.step(scan)
     assert (first.do, first.tries) == ("try", 0)
     history = read_history(scan.parent / "history.json")
@@ -551,6 +554,7 @@ def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
         (["--outcome", "0", "--grasp-width", "nan"], "--outcome: setting 'grasp_width'"),
         (["--out", "heat.obj"], "not a kind of heatmap"),
         (["--budget", "0"], "at least one interaction"),
+        (["--proposer", "afps"], "allowed: aip, information-gain"),
         (["--points", "9"], "allowed are 64 to 16384"),
     ):
         assert adaafford(["adapt", *where, *wrong]) == 2
@@ -567,7 +571,6 @@ def test_a_robot_may_follow_line_by_line(policy_folder: Path, scan: Path) -> Non
     done = subprocess.run(command, input=b"\n".join(lines) + b"\n", capture_output=True, check=True)
     first, second, *refused = [json.loads(line) for line in done.stdout.splitlines()]
     assert [first["tries"], second["tries"]] == [0, 1]
-    assert second["seconds"] < 1
     assert [list(each) for each in refused] == [["error"]] * 3
 
 
