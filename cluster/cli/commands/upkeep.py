@@ -163,7 +163,7 @@ def _merge(command: MergeCommand) -> int:
 
 
 def _export(command: ExportCommand) -> int:
-    from learner.data.dataset import read_object_list
+    from learner.data.sampling import read_object_list
     from shared.store import Store, export
     from shared.store.maintenance.export import splits_by_share
 
