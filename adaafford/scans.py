@@ -28,10 +28,9 @@ from adaafford.recordings import WHOLE, Selection, is_recording, take_scan
 from shared import seeds
 from shared.config import CameraConfig, StrictModel, parse
 from shared.errors import UsageError
-from shared.geometry import camera_pose, gripper_rotation
+from shared.geometry import camera_pose, estimated_normals, facing, furthest_first, gripper_rotation
 from shared.io.files import read_bounded
-from shared.observation import estimated_normals, facing, furthest_first, round_normals, round_points
-from shared.types import Action, Float, Float32, Observation
+from shared.types import Action, Float, Float32, Observation, round_normals, round_points
 
 MIN_POINTS, MAX_POINTS = 64, 1920 * 1080
 MAX_ROWS = 1 << 23

@@ -18,13 +18,12 @@ from benchmarks.script import main
 from cluster.cli.commands.bench import StoredSettings, source_of, stored
 from shared.errors import UsageError
 from shared.networks.network_config import NetworkConfig
-from shared.observation import round_points
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
 from shared.policies.proposers import AipProposer
 from shared.progress import Advance, Progress
 from shared.store import Store
-from shared.types import Interaction, Observation, Outcome, OutcomeKind
+from shared.types import Interaction, Observation, Outcome, OutcomeKind, round_points
 
 SIZES = (2048, 4096, 10_000)
 """Points of a cloud: as collected here, and up to what was published."""

@@ -18,7 +18,8 @@ from benchmarks.script import main
 from benchmarks.straightforward import POINTS, PublishedStep
 from cluster.cli.benchmarks.learning import NETWORKS, stages_of, training_rate
 from cluster.cli.commands.bench import StoredSettings, source_of, stored
-from learner.data.dataset import Dataset, load_dataset, split
+from learner.data.dataset import Dataset, load_dataset
+from learner.data.sampling import split
 from learner.settings import LearnerConfig
 from learner.training.hardware import Hardware
 from learner.training.loop import Stage

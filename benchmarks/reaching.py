@@ -18,11 +18,10 @@ from adaafford.pretrained import load_policy
 from benchmarks.script import main
 from cluster.cli.commands.bench import BenchSettings, planned
 from cluster.reporting.collecting import wilson
-from collector.domain_randomisation import object_of
 from collector.objects.articulation import surface_at
 from collector.objects.cache import ObjectCache
 from collector.random_proposer import RandomProposer
-from collector.rollout import Start, begin
+from collector.rollout import Start, begin, object_of
 from collector.sim.armed import ArmedEnvironment
 from collector.stopwatch import StageClock
 from shared.arms.arm import Arm

@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-from collector.domain_randomisation import object_of
 from collector.objects.cache import ObjectCache
 from collector.objects.catalogue import for_task, scan
-from collector.rollout import Start, begin
+from collector.rollout import Start, begin, object_of
 from collector.setting import make_setting
 from collector.stopwatch import StageClock
 from shared.config import CollectionConfig

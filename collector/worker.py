@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import psutil
 
-from collector.domain_randomisation import object_of
 from collector.job_result import JobResult
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.cache import ObjectCache
 from collector.random_proposer import RandomProposer
-from collector.rollout import quarantined_rollout, run_rollout
+from collector.rollout import object_of, quarantined_rollout, run_rollout
 from collector.setting import check_packages
 from collector.stopwatch import StageClock
 from collector.watchdog import UnderWay

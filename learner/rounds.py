@@ -19,7 +19,7 @@ from typing import Annotated, Any
 from pydantic import Field, RootModel
 
 from learner.alternation import Collect, Finished, Publish
-from learner.data.dataset import kept_for_validation
+from learner.data.sampling import kept_for_validation
 from learner.settings import PUBLISHED_FILE
 from learner.stages.jobs import StageJob
 from learner.training import data_parallel

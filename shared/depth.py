@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.observation import round_points
-from shared.types import Float, Float32
+from shared.types import Float, Float32, round_points
 
 DEPTH_STEP = 0.00025
 """m, from one depth to the next. Depths are told from the depth of the world's origin, so that 16 bits reach 8 m."""

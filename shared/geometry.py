@@ -1,4 +1,4 @@
-"""Frames and rotations. Matrices are written target_from_source and act on columns.
+"""Frames and rotations, and clouds. Matrices are written target_from_source and act on columns.
 
 The *view* frame is where networks work: the world turned about z so that the camera looks along +x, origin kept at the
 object's. It keeps gravity pointing down and forgets the azimuth, which carries no information.
@@ -7,7 +7,9 @@ object's. It keeps gravity pointing down and forgets the azimuth, which carries 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.types import Float, Observation
+from shared.types import Float, Float32, Observation
+
+NORMAL_NEIGHBOURS = 16
 
 
 def camera_pose(azimuth_deg: float, elevation_deg: float, distance: float) -> Float:
@@ -85,3 +87,51 @@ def quaternion_from_rotation(rotation: Float) -> Float:
     )
     quaternion = np.linalg.eigh(k)[1][:, -1]
     return quaternion if quaternion[0] >= 0 else -quaternion
+
+
+def furthest_first(points: Float | Float32, count: int, candidates: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Indices of selected points in furthest-point order, so that any prefix covers the cloud.
+
+    Args:
+        points: [M, 3], at least one.
+        count: number of selected points; if there are fewer points, some occur twice.
+        candidates: number of random points among which the furthest are searched.
+        rng: draws the candidates.
+
+    Returns:
+        [count].
+    """
+    # Here, because Numba takes a third of a second to import and only those who observe need it.
+    from shared.policies.furthest_points import furthest_points
+
+    chosen = np.arange(len(points))
+    if len(points) > candidates:
+        chosen = rng.choice(len(points), candidates, replace=False)
+    elif len(points) < count:
+        chosen = np.concatenate([chosen, rng.integers(len(points), size=count - len(points))])
+    kept: NDArray[np.int64] = chosen[furthest_points(points[chosen].astype(np.float32), count)]
+    return kept
+
+
+def estimated_normals(cloud: Float, points: Float) -> Float:
+    """Normals of a measured surface: of the planes through the nearest points, [N, 3], of either sign.
+
+    Args:
+        cloud: [M, 3], all that was measured.
+        points: [N, 3], where.
+    """
+    from scipy.spatial import cKDTree
+
+    _, near = cKDTree(cloud).query(points, k=min(NORMAL_NEIGHBOURS, len(cloud)))
+    near = near.reshape(len(points), -1)
+    local = cloud[near] - cloud[near].mean(axis=1, keepdims=True)
+    normals: Float = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
+    return normals
+
+
+def facing(normals: Float, points: Float, camera: Float) -> Float:
+    """Unit normals, [N, 3], that face a camera, [3], from `points`, [N, 3]."""
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    towards = (normals * (camera - points)).sum(axis=1, keepdims=True)
+    turned: Float = np.where(towards < 0, -normals, normals)
+    return turned

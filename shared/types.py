@@ -29,6 +29,8 @@ Float32 = NDArray[np.float32]
 
 MAX_GRASP_WIDTH = 0.5
 """Metres; no hand opens further."""
+NORMAL_STEPS = 127
+"""Normals are kept as three signed bytes of 1/127, within half a degree; points as float16, about 0.5 mm at 1 unit."""
 
 
 class OutcomeKind(StrEnum):
@@ -161,7 +163,8 @@ class Reach(Protocol):
 class Observation:
     """A partial cloud of one object from one camera, in furthest-point order: any prefix covers the object.
 
-    Points and normals are rounded to what the store keeps, so that a proposer sees what a learner will.
+    Points and normals are rounded to what the store keeps (`round_points`, `round_normals`), so that a proposer sees
+    exactly what a learner will.
     """
 
     points: Float32
@@ -180,6 +183,27 @@ class Observation:
     """The whole of what the sensor measured, where it was kept: `collection.camera.keep_depth`, or a robot's scan."""
     reach: Reach | None = None
     """The arm that will execute the action, where the proposer is to know it; it then proposes what the arm reaches."""
+
+
+def round_points(points: Float | Float32) -> Float32:
+    """Points, [..., 3], rounded to float16."""
+    return points.astype(np.float16).astype(np.float32)
+
+
+def round_normals(normals: Float | Float32) -> Float32:
+    """Unit normals, [..., 3], with each component at the nearest multiple of 1/127."""
+    return unpack_normals(pack_normals(normals))
+
+
+def pack_normals(normals: Float | Float32) -> NDArray[np.int8]:
+    """Unit normals, [..., 3], as signed bytes."""
+    packed: NDArray[np.int8] = np.rint(np.clip(normals, -1.0, 1.0) * NORMAL_STEPS).astype(np.int8)
+    return packed
+
+
+def unpack_normals(packed: NDArray[np.int8]) -> Float32:
+    """The normals, [..., 3], that `pack_normals` kept."""
+    return packed.astype(np.float32) / np.float32(NORMAL_STEPS)
 
 
 @dataclass(frozen=True, slots=True)

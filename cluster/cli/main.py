@@ -44,7 +44,7 @@ COMMANDS = {
     "status": "status of a run or a store: rate, done, left, workers",
     "learn": "train beside a collection: wait for rollouts, and publish policies",
     "view": "a store, a run or a scan in the browser: rollouts, beliefs, simulations; marks of movable points",
-    "store": "info, verify, digest, replay, repair, compact, merge, export, migrate or check-place: work with stores",
+    "store": "info, verify, digest, replay, repair, compact, merge, export or check-place: work with stores",
     "objects": "generate, import, export, check, preview, film or decompose objects",
     "bench": "fidelity, dynamics, collect or learner: measure what helps to choose settings",
     "version": "print the version",

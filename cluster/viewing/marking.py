@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from adaafford.scans import Scan, npz_of
 from shared.errors import UsageError
+from shared.geometry import estimated_normals
 from shared.io.files import create_exclusively, write_atomically, writing
-from shared.observation import estimated_normals
 from shared.types import Float
 
 WORKING_POINTS = 100_000

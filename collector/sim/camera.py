@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from collector.objects.articulation import ArticulatedObject, Body
 from shared.config import CameraConfig
 from shared.depth import DepthMap
-from shared.observation import estimated_normals, facing, furthest_first, round_normals, round_points
-from shared.types import Float, Observation
+from shared.geometry import estimated_normals, facing, furthest_first
+from shared.types import Float, Observation, round_normals, round_points
 
 NEAR, FAR = 0.1, 100.0
 """Published clipping distances."""

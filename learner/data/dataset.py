@@ -1,12 +1,14 @@
 """A store as compact arrays: every cloud once, its neighbour indices once, and rows grouped by rollout.
 
+What cannot be seen is among them, as numbers for the oracle: hidden dynamics, and the ways in which the part can move.
+A row's *twist* (w, v) says how its part moves: a point p that turns or slides by a small q is displaced by
+q (w x p + v). It tells the side of a hinge and its sign.
+
 Shapes: O clouds, N points, I interactions.
 """
 
-import zlib
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,16 +18,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.data.privileged import HiddenColumns, facts_of
 from learner.training.hardware import moved
-from shared.config import DynamicsRanges
+from shared.config import DynamicsRanges, Range
 from shared.errors import StoreError, UsageError
 from shared.geometry import view_from_world
-from shared.io.files import read_named
+from shared.hidden import ALWAYS_DRAWN
 from shared.networks.actions import middle_of, outcome_details
-from shared.networks.grouping import group_cloud
 from shared.networks.network_config import NetworkConfig
-from shared.networks.pointnet2 import CloudBatch
+from shared.networks.pointnet2 import CloudBatch, group_cloud
 from shared.pinch import PROFILE_WIDTH, REACH_M, pinch_profiles
 from shared.store.clouds import observations_at
 from shared.store.codecs.columns import LIST, Column, hidden_names, interaction_columns
@@ -40,9 +40,22 @@ COLUMNS = (
     *("joint_positions", "joint_limits", "joint_twist", "outcome", "motion", "success"),
     "grasp_opening",
 )
-MAX_LIST_BYTES = 1 << 20
-VALIDATION_SHARE = 5
-"""Without lists of objects, one object in this many is kept for validation, chosen by a hash of its id."""
+WAY_WIDTH = 7
+WAYS_WIDTH = 2 * WAY_WIDTH
+FACTS_WIDTH = len(ALWAYS_DRAWN) + WAYS_WIDTH
+"""Where no other hidden parameters are drawn than always; each further one adds a number."""
+_TOLD_AS: dict[str, Callable[[Float], Float]] = {
+    "part_mass": lambda values: np.log(np.maximum(values, 1e-6)),
+    "joint_friction": lambda values: values,
+    "surface_friction": lambda values: np.log(np.maximum(values, 1e-6)),
+}
+"""How oracles were told these from the beginning; others are told as a place in their range."""
+MIN_ROOM = 0.01
+"""A part that has less room, rad or length, cannot move that way: no such motion would count as a success."""
+MIN_TURNING = 0.1
+"""Length of w below which a part slides; that of a hinge is 1."""
+MAX_ROOM = 3.15
+"""A joint without limits has as much room as half a turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +72,7 @@ class Rows:
         details: kinds and grasp widths of the outcomes, [I, DETAIL_WIDTH] (see `shared.networks.actions`).
         step: [I], number within the rollout.
         continued: [I], whether the row began where the one before it left the object.
-        facts: [I, facts], for the oracle only (see `learner.data.privileged`).
+        facts: [I, facts], for the oracle only (see `facts_of`).
         valid: [I], whether the primitive ran to its end (see `shared.types.OutcomeKind.is_valid`).
         role, method: [I], names (see `shared.plan.InteractionRecord`).
         budget: [I].
@@ -151,14 +164,6 @@ class Dataset:
         return tuple(number for number, name in enumerate(self.objects) if name in objects)
 
 
-@dataclass(frozen=True, slots=True)
-class Split:
-    """Rollouts to learn from, and rollouts of other objects to judge by."""
-
-    train: tuple[int, ...]
-    validation: tuple[int, ...]
-
-
 def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
     """Load all labels of a store.
 
@@ -207,70 +212,6 @@ def load_dataset(store: Store, config: NetworkConfig) -> Dataset:
         versions=tuple(np.maximum.reduceat(cells["policy_version"][order], starts).tolist()),
         dense=dense,
     )
-
-
-def split(dataset: Dataset, train: Collection[str] | None, validation: Collection[str] | None) -> Split:
-    """Split a data set's rollouts by object.
-
-    Args:
-        dataset: the interactions.
-        train: ids of the objects to learn from; None: all but those for validation.
-        validation: ids of the objects to judge by; None: all but those for training, or, where these are not given
-            either, one object in five, by a hash of its id.
-
-    Raises:
-        UsageError: an object is in both, or one of the two has no rollout.
-    """
-    leaked = sorted(set(train or ()) & set(validation or ()))
-    if leaked:
-        raise UsageError(f"object '{leaked[0]}' is listed for training and for validation; list each object once")
-    if validation is None:
-        validation = set(dataset.objects) - set(train) if train is not None else kept_for_validation(dataset.objects)
-    if train is None:
-        train = set(dataset.objects) - set(validation)
-    parts = Split(dataset.rollouts_of(train), dataset.rollouts_of(validation))
-    for name, found in (("training", parts.train), ("validation", parts.validation)):
-        if not found:
-            raise UsageError(f"no rollout of the store is of an object for {name}; collect or list more objects")
-    return parts
-
-
-def kept_for_validation(objects: Iterable[str]) -> frozenset[str]:
-    """One object in five, by a hash of its id, and at least one."""
-    # A rank, instead of a remainder of the hash, never comes out empty for few objects.
-    ranked = sorted(set(objects), key=lambda name: (zlib.crc32(name.encode()), name))
-    return frozenset(ranked[: max(1, len(ranked) // VALIDATION_SHARE)])
-
-
-def without_later(dataset: Dataset, parts: Split, newest: int) -> Split:
-    """The split without what policies later than `newest` proposed to learn from; what is judged by stays.
-
-    Raises:
-        UsageError: nothing is left.
-    """
-    train = tuple(number for number in parts.train if dataset.versions[number] <= newest)
-    if not train:
-        raise UsageError(f"no rollout to learn from is of policy {newest} or older; collect some at random first")
-    return Split(train, parts.validation)
-
-
-def read_object_list(path: Path | None) -> frozenset[str] | None:
-    """Object ids, one a line; what follows a blank (such as Where2Act's category) is ignored.
-
-    Raises:
-        UsageError: the file is missing, too large, not text, or lists nothing.
-    """
-    if path is None:
-        return None
-    advice = "name a text file with one object id a line"
-    try:
-        lines = read_named(path, MAX_LIST_BYTES, advice).decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise UsageError(f"{path}: not text; {advice}") from None
-    names = frozenset(line.split()[0] for line in lines if line.split())
-    if not names:
-        raise UsageError(f"{path}: lists no object; write one object id a line")
-    return names
 
 
 def _cells(table: Any, column: Column[Any]) -> Any:
@@ -376,6 +317,66 @@ def _rows(
         method=cells["method"],
         budget=cells["budget"].astype(np.int64),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class HiddenColumns:
+    """Columns of the store that facts are made from.
+
+    Attributes:
+        twist: [I, 6], (w, v) of the target joint, world frame.
+        room: [I, 2], how far the target joint can go up and down from where it starts.
+        dynamics: [I] each, the values of the hidden parameters.
+        ranges: that they were drawn from.
+        view: [I, 3, 3], view frame from world frame.
+        middle: [I, 3], view frame, of what may be moved; actions are told their places from there.
+    """
+
+    twist: Float
+    room: Float
+    dynamics: Mapping[str, Float]
+    ranges: DynamicsRanges
+    view: Float
+    middle: Float
+
+
+def facts_of(hidden: HiddenColumns) -> Float:
+    """Facts for the oracle, [I, FACTS_WIDTH or more], in the view frame.
+
+    Columns: a number for each hidden parameter, first those that are always drawn; for each of the two ways in which
+    the part might move, the room that it has and its twist (w, v), zero where there is no room. A joint's sign is a
+    convention of its file, so that the ways come in an order of their own (`ordered_ways`).
+    """
+    turned = np.einsum("iab,icb->ica", hidden.view, hidden.twist.reshape(-1, 2, 3))
+    # w x p + v is the same motion, whatever point p and v are taken from.
+    turned[:, 1] += np.cross(turned[:, 0], hidden.middle)
+    turned = turned.reshape(-1, 6)
+    told = [_TOLD_AS[name](hidden.dynamics[name]) for name in ALWAYS_DRAWN]
+    told += [_place(hidden.dynamics[name], hidden.ranges[name]) for name in hidden.ranges.added]
+    room = np.clip(np.nan_to_num(hidden.room, nan=0.0, posinf=MAX_ROOM), 0.0, MAX_ROOM)[..., None]
+    both = np.stack([turned, -turned], axis=1) * (room > MIN_ROOM)
+    ways = ordered_ways(torch.from_numpy(np.concatenate([room, both], axis=2))).numpy()
+    return np.concatenate([np.stack(told, axis=1), ways.reshape(len(ways), -1)], axis=1)
+
+
+def _place(values: Float, interval: Range) -> Float:
+    """Where values lie in an interval that they were drawn from: -1 at its lower end, 1 at its upper end."""
+    low, high = interval.low, interval.high
+    if interval.log:
+        low, high, values = np.log(low), np.log(high), np.log(np.maximum(values, 1e-12))
+    return np.asarray(2.0 * (values - low) / max(high - low, 1e-12) - 1.0)
+
+
+def ordered_ways(ways: Tensor) -> Tensor:
+    """The two ways of each part, [..., 2, WAY_WIDTH], the one about (or along) the more positive axis first.
+
+    The axis counts by its largest component; that of a twist whose w is zero is v.
+    """
+    difference = ways[..., 0, 1:] - ways[..., 1, 1:]
+    turning, sliding = difference[..., :3], difference[..., 3:]
+    axis = torch.where(turning.norm(dim=-1, keepdim=True) > MIN_TURNING, turning, sliding)
+    largest = torch.gather(axis, -1, axis.abs().argmax(dim=-1, keepdim=True))
+    return torch.where((largest < 0)[..., None], ways.flip(-2), ways)
 
 
 def _room(cells: dict[str, Any]) -> NDArray[np.float64]:

@@ -1,19 +1,104 @@
-"""Batches: which rows are context, which are asked about, and which clouds that needs.
+"""Batches: which rollouts are learnt from, which rows are context, which are asked about, and how they are seen.
+
+Not in the paper: the same interactions are seen turned about the vertical, and in a mirror. Gravity points down in the
+view frame, so that physics is the same after a turn about z or a reflection of y; the hand is its own mirror image once
+its fingers are swapped, which keeps approach and forward. Neighbours stay neighbours.
 
 Shapes: B ordered sets of interactions, n rows of each (padded), K the longest context.
 """
 
-from collections.abc import Sequence
+import zlib
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.data.augmentation import flip_frames, turn_facts, turn_frames, turn_vectors
-from learner.data.dataset import Dataset
+from learner.data.dataset import WAY_WIDTH, WAYS_WIDTH, Dataset, ordered_ways
+from learner.settings import AugmentationConfig
+from shared.errors import UsageError
+from shared.io.files import read_named
+from shared.networks.actions import FRAME_WIDTH, swapped_fingers, turned_over
 from shared.networks.pointnet2 import CloudBatch, PointNet2
+
+MAX_LIST_BYTES = 1 << 20
+VALIDATION_SHARE = 5
+"""Without lists of objects, one object in this many is kept for validation, chosen by a hash of its id."""
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Rollouts to learn from, and rollouts of other objects to judge by."""
+
+    train: tuple[int, ...]
+    validation: tuple[int, ...]
+
+
+def split(dataset: Dataset, train: Collection[str] | None, validation: Collection[str] | None) -> Split:
+    """Split a data set's rollouts by object.
+
+    Args:
+        dataset: the interactions.
+        train: ids of the objects to learn from; None: all but those for validation.
+        validation: ids of the objects to judge by; None: all but those for training, or, where these are not given
+            either, one object in five, by a hash of its id.
+
+    Raises:
+        UsageError: an object is in both, or one of the two has no rollout.
+    """
+    leaked = sorted(set(train or ()) & set(validation or ()))
+    if leaked:
+        raise UsageError(f"object '{leaked[0]}' is listed for training and for validation; list each object once")
+    if validation is None:
+        validation = set(dataset.objects) - set(train) if train is not None else kept_for_validation(dataset.objects)
+    if train is None:
+        train = set(dataset.objects) - set(validation)
+    parts = Split(dataset.rollouts_of(train), dataset.rollouts_of(validation))
+    for name, found in (("training", parts.train), ("validation", parts.validation)):
+        if not found:
+            raise UsageError(f"no rollout of the store is of an object for {name}; collect or list more objects")
+    return parts
+
+
+def kept_for_validation(objects: Iterable[str]) -> frozenset[str]:
+    """One object in five, by a hash of its id, and at least one."""
+    # A rank, instead of a remainder of the hash, never comes out empty for few objects.
+    ranked = sorted(set(objects), key=lambda name: (zlib.crc32(name.encode()), name))
+    return frozenset(ranked[: max(1, len(ranked) // VALIDATION_SHARE)])
+
+
+def without_later(dataset: Dataset, parts: Split, newest: int) -> Split:
+    """The split without what policies later than `newest` proposed to learn from; what is judged by stays.
+
+    Raises:
+        UsageError: nothing is left.
+    """
+    train = tuple(number for number in parts.train if dataset.versions[number] <= newest)
+    if not train:
+        raise UsageError(f"no rollout to learn from is of policy {newest} or older; collect some at random first")
+    return Split(train, parts.validation)
+
+
+def read_object_list(path: Path | None) -> frozenset[str] | None:
+    """Object ids, one a line; what follows a blank (such as Where2Act's category) is ignored.
+
+    Raises:
+        UsageError: the file is missing, too large, not text, or lists nothing.
+    """
+    if path is None:
+        return None
+    advice = "name a text file with one object id a line"
+    try:
+        lines = read_named(path, MAX_LIST_BYTES, advice).decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise UsageError(f"{path}: not text; {advice}") from None
+    names = frozenset(line.split()[0] for line in lines if line.split())
+    if not names:
+        raise UsageError(f"{path}: lists no object; write one object id a line")
+    return names
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,3 +246,58 @@ def spread(numbers: Sequence[int], most: int) -> list[int]:
 def draw(numbers: Sequence[int], most: int, rng: np.random.Generator) -> list[int]:
     """At most `most` of the numbers at random, each once."""
     return [numbers[place] for place in rng.choice(len(numbers), min(most, len(numbers)), replace=False)]
+
+
+def draw_turns(count: int, config: AugmentationConfig, rng: np.random.Generator) -> Tensor:
+    """Orthogonal matrices that keep the vertical, [count, 3, 3]."""
+    angle = np.deg2rad(config.turn_deg) * rng.uniform(-1.0, 1.0, count)
+    mirrored = rng.random(count) < 0.5 if config.mirror else np.zeros(count, dtype=bool)
+    cos, sin, sign = np.cos(angle), np.sin(angle), np.where(mirrored, -1.0, 1.0)
+    turns = np.zeros((count, 3, 3), dtype=np.float32)
+    turns[:, 0, 0], turns[:, 0, 1] = cos, -sin * sign
+    turns[:, 1, 0], turns[:, 1, 1] = sin, cos * sign
+    turns[:, 2, 2] = 1.0
+    return torch.as_tensor(turns)
+
+
+def draw_flips(count: int, config: AugmentationConfig, rng: np.random.Generator) -> Tensor:
+    """Whether the gripper is turned about its approach in each set, [count]."""
+    return torch.as_tensor(rng.random(count) < 0.5 if config.flip else np.zeros(count, dtype=bool))
+
+
+def turn_frames(turns: Tensor, frames: Tensor) -> Tensor:
+    """Frames with or without pinch profiles, [B, n, 6 or more], after the turns [B, 3, 3]."""
+    if frames.shape[-1] == FRAME_WIDTH:
+        return turn_vectors(turns, frames)
+    turned = torch.cat([turn_vectors(turns, frames[..., :FRAME_WIDTH]), frames[..., FRAME_WIDTH:]], dim=-1)
+    # A mirror keeps approach and forward, and so swaps the fingers.
+    return torch.where((torch.linalg.det(turns) < 0)[:, None, None], swapped_fingers(turned), turned)
+
+
+def flip_frames(flips: Tensor, frames: Tensor) -> Tensor:
+    """Frames with or without pinch profiles, [B, n, 6 or more], turned about the approach in the sets `flips`, [B]."""
+    return torch.where(flips[:, None, None], turned_over(frames), frames) if flips.any() else frames
+
+
+def turn_vectors(turns: Tensor, vectors: Tensor) -> Tensor:
+    """Vectors or points, [B, n, 3 k], each three of them turned by the matrices [B, 3, 3]."""
+    triples = vectors.reshape(*vectors.shape[:2], -1, 3)
+    return _turned(turns, triples).reshape(vectors.shape)
+
+
+def turn_facts(turns: Tensor, facts: Tensor) -> Tensor:
+    """Facts for the oracle, [B, n, facts], of what is seen after the turns (see `learner.data.dataset.facts_of`)."""
+    dynamics = facts[..., :-WAYS_WIDTH]
+    ways = facts[..., -WAYS_WIDTH:].reshape(*facts.shape[:2], 2, WAY_WIDTH)
+    room, turning, sliding = ways[..., :1], ways[..., 1:4], ways[..., 4:]
+    # An axis of rotation is the cross product of two vectors: a mirror turns it round beside reflecting it.
+    handed = torch.linalg.det(turns)[:, None, None, None]
+    turning = handed * _turned(turns, turning)
+    sliding = _turned(turns, sliding)
+    turned = ordered_ways(torch.cat([room, turning, sliding], dim=-1))
+    return torch.cat([dynamics, turned.flatten(-2)], dim=-1)
+
+
+def _turned(turns: Tensor, triples: Tensor) -> Tensor:
+    """Vectors [B, n, k, 3] turned; a sum of products, since a matrix product may be taken in half precision."""
+    return (turns[:, None, None] * triples[..., None, :]).sum(dim=-1)

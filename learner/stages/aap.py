@@ -3,27 +3,42 @@
 Shapes: I interactions, B rollouts, n rows of each, K the longest context.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from safetensors.torch import save
 from torch import Tensor, nn
 
-from learner.data.augmentation import draw_flips, draw_turns, flip_frames
-from learner.data.dataset import Dataset, Split
-from learner.data.features import FrozenFeatures
-from learner.data.sampling import Batch, OrderedRows, draw, order_rows, spread
+from learner.data.dataset import Dataset
+from learner.data.features import FrozenAap, FrozenFeatures
+from learner.data.sampling import (
+    Batch,
+    OrderedRows,
+    Split,
+    draw,
+    draw_flips,
+    draw_turns,
+    flip_frames,
+    order_rows,
+    spread,
+)
 from learner.metrics import discrimination, discrimination_in_chunks
 from learner.settings import AapConfig
+from learner.stages.affordance import AapCritic
 from learner.stages.oracle import OracleCritic, Teacher
-from learner.training.data_parallel import share
-from learner.training.loop import ParameterGroup, StepResult
+from learner.stages.trainers import ORACLE_FILE, ORACLE_FOLDER, StageTrainer
+from learner.training.data_parallel import rank, share
+from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_loss, distillation_loss
+from shared.io.files import write_atomically
 from shared.networks.aap import Aap
 from shared.networks.actions import without_details
 from shared.networks.pointnet2 import PointNet2
+from shared.seeds import torch_seed
 
 VALIDATION_ROLLOUTS = 32
 FROZEN_VALIDATION_ROLLOUTS = 192
@@ -249,3 +264,38 @@ def predict(aap: Aap, seen: SeenRows, context: int) -> PrefixPrediction:
     latents = aap.prefix_latents(*aap.interaction_codes(*(x[:, :context] for x in tries)))
     xyz, frames = seen.xyz[:, None], seen.frame[:, None]
     return PrefixPrediction(aap.action_logits(seen.features[:, None], xyz, frames, latents[:, :, None]), latents)
+
+
+def train_aap(recipe: StageTrainer) -> TrainingResult:
+    """Train the oracle, if the settings ask for it, then AAP, then its D."""
+    aap, config, pool = recipe.policy.aap.requires_grad_(True), recipe.config.aap, recipe.pool()
+    # An AAP that has been trained has a z of its own, which a new oracle would only disturb; the old one may teach.
+    trained, oracle = "aap" in recipe.policy.trained, recipe.oracle
+    if config.training == "privileged" and not trained:
+        oracle = _train_oracle(recipe)
+    teacher = recipe.teacher(oracle if config.training == "privileged" else None)
+    stage = AapStage(aap, recipe.known, recipe.parts, config, teacher, trained=trained)
+    result = recipe.runner.train(stage, config, "aap")
+    frozen = FrozenAap.of(aap, recipe.known)
+    affordance = recipe.affordance("aap", AapCritic(frozen, config.top), config.affordance, pool, frozen)
+    return recipe.runner.train_affordance(affordance, config.affordance, result)
+
+
+def _train_oracle(recipe: StageTrainer) -> OracleCritic:
+    """Train the oracle critic, save it, and start AAP from it."""
+    # Drawn on the CPU, so that the first weights are the same whatever device trains them.
+    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+        # This text is part of the seed: with another one, weights of earlier releases could not be made again.
+        torch.manual_seed(torch_seed(recipe.config.seed, "learner.oracle") % 2**32)
+        critic = OracleCritic(copy.deepcopy(recipe.policy.aap), recipe.dataset.rows.facts.shape[1])
+    critic.to(recipe.runner.hardware.device)
+    config = recipe.config.aap
+    settings = config.model_copy(update={"steps": config.oracle_steps, "learning_rate": config.oracle_learning_rate})
+    stage = OracleStage(critic, recipe.dataset, recipe.parts, config)
+    recipe.runner.train(stage, settings, "oracle", ORACLE_FOLDER)
+    if rank() == 0:
+        weights = save({name: tensor.contiguous() for name, tensor in critic.state_dict().items()})
+        write_atomically(recipe.runner.out / ORACLE_FILE, weights)
+    for inherited in ("encoder", "action_encoder", "critic_head"):
+        getattr(recipe.policy.aap, inherited).load_state_dict(getattr(critic.aap, inherited).state_dict())
+    return critic

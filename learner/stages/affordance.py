@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from learner.data.dataset import Dataset, Split
+from learner.data.dataset import Dataset
 from learner.data.features import FrozenAap, ProposalPool
-from learner.data.sampling import OrderedRows, draw, order_rows
+from learner.data.sampling import OrderedRows, Split, draw, order_rows
 from learner.metrics import rank_correlation
 from learner.settings import AffordanceConfig
 from learner.training.data_parallel import share

@@ -9,14 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from learner.data.dataset import Dataset, Split
+from learner.data.dataset import Dataset
 from learner.data.features import FrozenAap
-from learner.data.sampling import OrderedRows, draw, order_rows, spread
+from learner.data.sampling import OrderedRows, Split, draw, order_rows, spread
 from learner.metrics import correlation
 from learner.settings import AipConfig
+from learner.stages.affordance import AipCritic
 from learner.stages.oracle import Teacher
+from learner.stages.trainers import StageTrainer
 from learner.training.data_parallel import share
-from learner.training.loop import ParameterGroup, StepResult
+from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_losses, information_gains, information_loss, mean_information_loss
 from shared.networks.aip import Aip
 
@@ -149,3 +151,16 @@ class AipStage:
             flat = self.aip.encoder.at(encoded, cloud.flatten(), rows.point[tries].flatten())
             features = flat.reshape(*tries.shape, -1)
         return self.aip.action_scores(features, rows.xyz[tries], rows.frame[tries], found.latents, found.scores)
+
+
+def train_aip(recipe: StageTrainer) -> TrainingResult:
+    """Train AIP's critic, then its D; AAP stays as it is."""
+    aip, config, pool = recipe.policy.aip.requires_grad_(True), recipe.config.aip, recipe.pool()
+    frozen = FrozenAap.of(recipe.policy.aap, recipe.known)
+    teacher = recipe.teacher(recipe.oracle if config.training == "inherited" else None)
+    stage = AipStage(aip, recipe.dataset, recipe.parts, config, frozen, teacher)
+    result = recipe.runner.train(stage, config, "aip")
+    aip.eval().requires_grad_(False)
+    critic = AipCritic(aip, recipe.known.pool(aip.encoder), frozen, config.top)
+    affordance = recipe.affordance("aip", critic, config.affordance, pool, frozen)
+    return recipe.runner.train_affordance(affordance, config.affordance, result)

@@ -15,7 +15,7 @@ OUT/ of a stage
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -24,11 +24,23 @@ from typing import Any
 
 from pydantic import BaseModel, Field, TypeAdapter
 
-from learner.data.dataset import Dataset, Split, load_dataset, split, without_later
+from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import FrozenFeatures
+from learner.data.sampling import Split, split, without_later
 from learner.settings import METRICS_FILE, LearnerConfig
+from learner.stages.aap import train_aap
+from learner.stages.aip import train_aip
 from learner.stages.oracle import read_oracle
-from learner.stages.trainers import AFFORDANCE_FOLDER, ORACLE_FILE, ORACLE_FOLDER, Runner, StageTrainer
+from learner.stages.prior import train_prior
+from learner.stages.trainers import (
+    AFFORDANCE_FOLDER,
+    ORACLE_FILE,
+    ORACLE_FOLDER,
+    Runner,
+    StageTrainer,
+    settings_of,
+    training_of,
+)
 from learner.training import data_parallel
 from learner.training.checkpoint import check_fingerprint, read_cursor
 from learner.training.hardware import Hardware, hardware
@@ -65,6 +77,12 @@ NEEDED: dict[StageName, tuple[ModuleName, ...]] = {
     "aip": ("prior", "aap"),
 }
 """What must have been trained before; the last of them is the stage to start from. Baselines say it themselves."""
+TRAINED_BY: dict[StageName, Callable[[StageTrainer], TrainingResult]] = {
+    "prior": train_prior,
+    "aap": train_aap,
+    "aip": train_aip,
+}
+"""What trains the networks of a stage. Baselines say it themselves."""
 
 
 def needed(stage: StageName) -> tuple[ModuleName, ...]:
@@ -81,7 +99,7 @@ class StageJob:
         store: folder or URL of the store.
         out: folder for what it makes.
         init: folder with the policy to start from; None: random weights (the prior only).
-        train_objects: ids of the objects to learn from (see `learner.data.dataset.split`).
+        train_objects: ids of the objects to learn from (see `learner.data.sampling.split`).
         validation_objects: ids of the objects to judge by.
         snapshot: learn from these rollouts alone; None: from all that the store holds.
         newest_policy: rollouts that later policies proposed are left out of what is learnt from; None: all are in.
@@ -208,7 +226,7 @@ def _train(
     with hardware.home():
         runner = Runner(job.out, config.seed, fingerprint, hardware)
         told = None if oracle is None else read_oracle(oracle, policy.config).to(hardware.device)
-        result = StageTrainer(config, policy, known, parts, runner, told).train(job.stage)
+        result = _train_module(StageTrainer(config, policy, known, parts, runner, told), job.stage)
     policy.modules().to("cpu")
     policy.with_trained(job.stage)
     if data_parallel.rank() == 0:
@@ -216,6 +234,14 @@ def _train(
             write_atomically(job.out / ORACLE_FILE, read_bounded(oracle, MAX_WEIGHTS_BYTES))
         _finish(job, policy, result, fingerprint, _seen(job, store, dataset, parts))
     data_parallel.wait_for_all()
+
+
+def _train_module(recipe: StageTrainer, stage: StageName) -> TrainingResult:
+    """Train one module of the policy; the others stay as they are."""
+    recipe.policy.modules().eval().requires_grad_(False)
+    if stage in TRAINED_BY:
+        return TRAINED_BY[stage](recipe)
+    return training_of(stage).train(recipe, settings_of(recipe.config, stage))
 
 
 def _finish(job: StageJob, policy: Policy, result: TrainingResult, fingerprint: str, seen: Collection[str]) -> None:

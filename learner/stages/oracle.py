@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from learner.data.dataset import FACTS_WIDTH
 from learner.data.features import FrozenFeatures
-from learner.data.privileged import FACTS_WIDTH
 from learner.data.sampling import Batch
 from shared.errors import UsageError
 from shared.io.files import read_bounded

@@ -11,14 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from learner.data.augmentation import draw_flips, draw_turns, flip_frames, turn_frames, turn_vectors
-from learner.data.dataset import Dataset, Split
+from learner.data.dataset import Dataset
 from learner.data.features import frozen_features
-from learner.data.sampling import draw, spread
+from learner.data.sampling import Split, draw, draw_flips, draw_turns, flip_frames, spread, turn_frames, turn_vectors
 from learner.metrics import discrimination
 from learner.settings import PriorConfig
+from learner.stages.affordance import PriorCritic
+from learner.stages.trainers import StageTrainer
 from learner.training.data_parallel import share
-from learner.training.loop import ParameterGroup, StepResult
+from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_loss, proposal_loss
 from shared.networks.prior import Prior
 
@@ -112,6 +113,16 @@ class PriorStage:
         rows = self.dataset.rows
         features = frozen_features(self.prior.encoder, self.dataset.clouds, rows.cloud[index], rows.point[index])
         return torch.sigmoid(self.prior.action_logits(features, rows.xyz[index], rows.frame[index]))
+
+
+def train_prior(recipe: StageTrainer) -> TrainingResult:
+    """Train the prior's proposals and critic, then its D."""
+    prior, config = recipe.policy.prior.requires_grad_(True), recipe.config.prior
+    result = recipe.runner.train(PriorStage(prior, recipe.dataset, recipe.parts, config), config, "prior")
+    prior.eval().requires_grad_(False)
+    pool = recipe.pool()
+    affordance = recipe.affordance("prior", PriorCritic(prior, pool), config.affordance, pool)
+    return recipe.runner.train_affordance(affordance, config.affordance, result)
 
 
 def _rows_of_clouds(dataset: Dataset, rollouts: tuple[int, ...]) -> list[np.ndarray]:

@@ -14,8 +14,7 @@ from learner.training.loop import ParameterGroup, StepResult, TrainingResult, tr
 from shared import seeds
 from shared.errors import UsageError
 from shared.io.files import make_folder, write_atomically
-from shared.networks.grouping import group_cloud
-from shared.networks.pointnet2 import CloudBatch
+from shared.networks.pointnet2 import CloudBatch, group_cloud
 from shared.networks.segmentation import SEGMENTATION_NETWORK, SegmentationNetwork
 from shared.segmentation.scenes import MOVABLE, Kind, Scene, read_scene, read_scenes_document, scene_path
 from shared.segmentation.segmenter import Segmenter, begun

@@ -1,33 +1,26 @@
-"""What each stage trains, one network after the other."""
+"""What the trainings of all stages have in common, and how those of baselines are found."""
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, Protocol
 
-import torch
-from safetensors.torch import save
 from torch import Tensor
 
-from learner.data.dataset import Dataset, Split
+from learner.data.dataset import Dataset
 from learner.data.features import FrozenAap, FrozenFeatures, ProposalPool
+from learner.data.sampling import Split
 from learner.settings import AffordanceConfig, LearnerConfig, LearnerSettings, TrainingConfig
-from learner.stages.aap import AapStage, OracleStage
-from learner.stages.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic, RowOrder
-from learner.stages.aip import AipStage
+from learner.stages.affordance import AffordanceStage, Critic, RowOrder
 from learner.stages.oracle import OracleCritic, Teacher
-from learner.stages.prior import PriorStage
-from learner.training import data_parallel
 from learner.training.hardware import Hardware
 from learner.training.loop import Stage, TrainingResult, train
 from shared.config import parse
 from shared.errors import UsageError
-from shared.io.files import write_atomically
 from shared.policies.methods import BASELINES, BaselineName, ModuleName
 from shared.policies.policy import Policy
-from shared.seeds import generator, torch_seed
+from shared.seeds import generator
 
 ORACLE_FILE = "oracle.safetensors"
 ORACLE_FOLDER = "oracle"
@@ -63,6 +56,9 @@ class Runner:
 class StageTrainer:
     """What the stages have in common: a policy of which one module is trained, from what, and how.
 
+    Each stage has a function that trains its networks with it, one after the other, such as
+    `learner.stages.aap.train_aap`.
+
     Attributes:
         config: the settings.
         policy: the modules.
@@ -83,51 +79,6 @@ class StageTrainer:
     def dataset(self) -> Dataset:
         """The interactions."""
         return self.known.dataset
-
-    def train(self, stage: ModuleName) -> TrainingResult:
-        """Train one module of the policy; the others stay as they are."""
-        self.policy.modules().eval().requires_grad_(False)
-        match stage:
-            case "prior":
-                return self._prior()
-            case "aap":
-                return self._aap()
-            case "aip":
-                return self._aip()
-            case _:
-                return training_of(stage).train(self, settings_of(self.config, stage))
-
-    def _prior(self) -> TrainingResult:
-        prior, config = self.policy.prior.requires_grad_(True), self.config.prior
-        result = self.runner.train(PriorStage(prior, self.dataset, self.parts, config), config, "prior")
-        prior.eval().requires_grad_(False)
-        pool = self.pool()
-        affordance = self.affordance("prior", PriorCritic(prior, pool), config.affordance, pool)
-        return self.runner.train_affordance(affordance, config.affordance, result)
-
-    def _aap(self) -> TrainingResult:
-        aap, config, pool = self.policy.aap.requires_grad_(True), self.config.aap, self.pool()
-        # An AAP that has been trained has a z of its own, which a new oracle would only disturb; the old one may teach.
-        trained, oracle = "aap" in self.policy.trained, self.oracle
-        if config.training == "privileged" and not trained:
-            oracle = self._oracle()
-        teacher = self._teacher(oracle if config.training == "privileged" else None)
-        stage = AapStage(aap, self.known, self.parts, config, teacher, trained=trained)
-        result = self.runner.train(stage, config, "aap")
-        frozen = FrozenAap.of(aap, self.known)
-        affordance = self.affordance("aap", AapCritic(frozen, config.top), config.affordance, pool, frozen)
-        return self.runner.train_affordance(affordance, config.affordance, result)
-
-    def _aip(self) -> TrainingResult:
-        aip, config, pool = self.policy.aip.requires_grad_(True), self.config.aip, self.pool()
-        frozen = FrozenAap.of(self.policy.aap, self.known)
-        teacher = self._teacher(self.oracle if config.training == "inherited" else None)
-        stage = AipStage(aip, self.dataset, self.parts, config, frozen, teacher)
-        result = self.runner.train(stage, config, "aip")
-        aip.eval().requires_grad_(False)
-        critic = AipCritic(aip, self.known.pool(aip.encoder), frozen, config.top)
-        affordance = self.affordance("aip", critic, config.affordance, pool, frozen)
-        return self.runner.train_affordance(affordance, config.affordance, result)
 
     def affordance(
         self,
@@ -150,29 +101,9 @@ class StageTrainer:
         """Rotations that the prior proposes at the points of the pool."""
         return ProposalPool.of(self.policy.prior, self.known)
 
-    def _teacher(self, oracle: OracleCritic | None) -> Teacher | None:
-        """What the oracle says of all rows; nothing where there is none."""
+    def teacher(self, oracle: OracleCritic | None) -> Teacher | None:
+        """What an oracle says of all rows; nothing where there is none."""
         return None if oracle is None else Teacher.of(oracle, self.known)
-
-    def _oracle(self) -> OracleCritic:
-        """Train the oracle critic, save it, and start AAP from it."""
-        # Drawn on the CPU, so that the first weights are the same whatever device trains them.
-        with torch.random.fork_rng(devices=[]), torch.device("cpu"):
-            # This text is part of the seed: with another one, weights of earlier releases could not be made again.
-            torch.manual_seed(torch_seed(self.config.seed, "learner.oracle") % 2**32)
-            critic = OracleCritic(copy.deepcopy(self.policy.aap), self.dataset.rows.facts.shape[1])
-        critic.to(self.runner.hardware.device)
-        config = self.config.aap
-        settings = config.model_copy(
-            update={"steps": config.oracle_steps, "learning_rate": config.oracle_learning_rate}
-        )
-        self.runner.train(OracleStage(critic, self.dataset, self.parts, config), settings, "oracle", ORACLE_FOLDER)
-        if data_parallel.rank() == 0:
-            weights = save({name: tensor.contiguous() for name, tensor in critic.state_dict().items()})
-            write_atomically(self.runner.out / ORACLE_FILE, weights)
-        for inherited in ("encoder", "action_encoder", "critic_head"):
-            getattr(self.policy.aap, inherited).load_state_dict(getattr(critic.aap, inherited).state_dict())
-        return critic
 
 
 class RowCritic(Protocol):

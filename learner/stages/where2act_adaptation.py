@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from learner.data.dataset import Dataset, Split
+from learner.data.dataset import Dataset
 from learner.data.features import FrozenFeatures, FrozenPrior
-from learner.data.sampling import OrderedRows, draw, order_rows, spread
+from learner.data.sampling import OrderedRows, Split, draw, order_rows, spread
 from learner.metrics import discrimination
 from learner.settings import AdaptationConfig
 from learner.stages.trainers import BaselineTraining, Load, StageTrainer

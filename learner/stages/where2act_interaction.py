@@ -10,10 +10,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from learner.data.augmentation import draw_flips, draw_turns
-from learner.data.dataset import Dataset, Split
+from learner.data.dataset import Dataset
 from learner.data.features import FrozenAap, FrozenFeatures, FrozenPrior
-from learner.data.sampling import Batch, OrderedRows, draw, padded, spread
+from learner.data.sampling import Batch, OrderedRows, Split, draw, draw_flips, draw_turns, padded, spread
 from learner.evaluation.critics import AdaptiveScores
 from learner.metrics import discrimination_in_chunks
 from learner.settings import InteractionConfig

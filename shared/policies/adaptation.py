@@ -22,8 +22,7 @@ from shared.geometry import gripper_rotation, points_in_view, view_from_world
 from shared.networks.aap import Aap
 from shared.networks.actions import FRAME_WIDTH, middle_of, outcome_details
 from shared.networks.aip import Aip
-from shared.networks.grouping import group_cloud, nearest_points
-from shared.networks.pointnet2 import CloudBatch, EncodedClouds
+from shared.networks.pointnet2 import CloudBatch, EncodedClouds, group_cloud, nearest_points
 from shared.networks.prior import Prior
 from shared.pinch import PROFILE_WIDTH, pinch_profiles
 from shared.policies.methods import ModuleName

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from shared import seeds
 from shared.errors import UsageError
-from shared.observation import furthest_first
+from shared.geometry import furthest_first
 from shared.types import Float, Float32
 
 TOLERANCE_M = 0.015

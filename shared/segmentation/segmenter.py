@@ -21,9 +21,8 @@ from scipy.spatial import cKDTree
 from shared.config import StrictModel
 from shared.errors import StoreError, UsageError
 from shared.io.documents import parse_document
-from shared.networks.grouping import group_cloud
 from shared.networks.network_config import NetworkConfig
-from shared.networks.pointnet2 import CloudBatch
+from shared.networks.pointnet2 import CloudBatch, group_cloud
 from shared.networks.segmentation import SEGMENTATION_NETWORK, SegmentationNetwork
 from shared.policies.policy import MAX_WEIGHTS_BYTES, WEIGHTS_FILE, read_tensors
 from shared.segmentation.inputs import EXTRA, SegmentationInput, network_input

@@ -7,7 +7,6 @@ from shared.store.maintenance.compaction import Compaction, compact, reopen_quar
 from shared.store.maintenance.export import Export, export
 from shared.store.maintenance.info import StoreInfo, SuccessCount, info
 from shared.store.maintenance.merging import Merged, merge
-from shared.store.maintenance.migration import Migrated, migrate
 from shared.store.maintenance.repair import Repair, repair
 from shared.store.maintenance.verify import Problem, verify
 from shared.store.store import Store
@@ -18,7 +17,6 @@ __all__ = [
     "Export",
     "FileEntry",
     "Merged",
-    "Migrated",
     "ObservationArrays",
     "Problem",
     "Quarantined",
@@ -32,7 +30,6 @@ __all__ = [
     "export",
     "info",
     "merge",
-    "migrate",
     "reopen_quarantined",
     "repair",
     "verify",

@@ -250,13 +250,9 @@ def check_schema_version(content: dict[str, Any], source: str) -> None:
         has_checksum(content | {"schema_version": right}) for right in READ_VERSIONS
     ):
         raise StoreError(f"{source}: names no schema version; the file is damaged: restore it from a copy")
-    older = (
-        "run `adaafford store migrate STORE --out NEW`"
-        if version < SCHEMA_VERSION
-        else "use the software that wrote it, or newer"
-    )
     raise SchemaVersionError(
-        f"{source}: schema version {version}, but this software reads {SCHEMA_VERSION} to {READ_VERSIONS[-1]}; {older}"
+        f"{source}: schema version {version}, but this software reads {SCHEMA_VERSION} to {READ_VERSIONS[-1]}; use the "
+        "software that wrote it, or newer"
     )
 
 

@@ -208,17 +208,6 @@ def copy_shard(source: Folder, manifest: ShardManifest, backend: StorageBackend)
     _publish(backend, manifest, read_files(source, manifest), vetted=True)
 
 
-def commit_files(backend: StorageBackend, manifest: ShardManifest, files: Mapping[str, bytes]) -> None:
-    """Commit a shard whose files are already encoded; the manifest's entries for them are made here.
-
-    Raises:
-        StoreError: the committed files cannot be read, or their rollouts do not match the manifest.
-    """
-    whole = manifest.model_copy(update={"files": file_entries(files)})
-    _publish(backend, whole, files, vetted=True)
-    _check_digests(shard_folder(backend, whole.shard_id), whole)
-
-
 def _check_digests(shard: Folder, manifest: ShardManifest) -> None:
     if tuple(rollout_digest(rollout) for rollout in read_rollouts(shard, manifest)) != manifest.digests:
         raise StoreError(f"{shard}: its rollouts are not those of its manifest; run `adaafford store verify`")

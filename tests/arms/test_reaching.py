@@ -15,10 +15,10 @@ from cluster.cli.main import run as adaafford
 from cluster.evaluation.rehearsal import Setting as Rehearsal
 from cluster.evaluation.rehearsal import SimulatedRobot
 from cluster.evaluation.resimulation import chosen_interactions, resimulate
-from collector.domain_randomisation import draw_arm_base
 from collector.objects.articulation import SURFACE_POINTS, surface_at
 from collector.objects.catalogue import load_ref, scan
 from collector.objects.procedural.catalogue import generate
+from collector.rollout import draw_arm_base
 from collector.setting import make_setting
 from collector.sim.armed import ArmedEnvironment
 from collector.sim.restoration import restored

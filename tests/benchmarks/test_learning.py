@@ -16,7 +16,8 @@ from cluster.cli.benchmarks.learning import NETWORKS as CRITICS
 from cluster.cli.benchmarks.learning import stages_of
 from cluster.cli.main import run
 from learner import settings
-from learner.data.dataset import load_dataset, split
+from learner.data.dataset import load_dataset
+from learner.data.sampling import split
 from learner.settings import AapConfig, AipConfig, LearnerConfig, PriorConfig
 from shared.networks.network_config import NETWORKS
 from shared.networks.pointnet2 import PointNet2

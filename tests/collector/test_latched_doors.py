@@ -15,8 +15,7 @@ from collector.objects.procedural import generate
 from collector.objects.readers import read_object
 from collector.sim.environment import SapienEnvironment
 from collector.stopwatch import StageClock
-from learner.data.dataset import load_dataset
-from learner.data.privileged import FACTS_WIDTH
+from learner.data.dataset import FACTS_WIDTH, load_dataset
 from shared.config import CameraConfig, CollectionConfig
 from shared.errors import UsageError
 from shared.geometry import camera_pose

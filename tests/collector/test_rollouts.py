@@ -8,12 +8,11 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from collector.domain_randomisation import draw_rollout, object_of
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import for_task, load_ref, scan
 from collector.objects.procedural import generate
 from collector.random_proposer import LEAST_COSINE, RandomProposer, edge_points, random_rotation
-from collector.rollout import run_rollout
+from collector.rollout import draw_rollout, object_of, run_rollout
 from collector.setting import packages_used
 from collector.sim.camera import EmbreeCamera, observation_from
 from collector.sim.environment import draw_state

@@ -18,9 +18,8 @@ from cluster.reporting.counterfactuals import variations
 from cluster.reporting.style import hidden
 from collector.sim.scene import Scene
 from collector.sim.trial import Trial
-from learner.data.dataset import load_dataset
+from learner.data.dataset import FACTS_WIDTH, load_dataset
 from learner.data.features import FrozenFeatures
-from learner.data.privileged import FACTS_WIDTH
 from learner.stages.jobs import StageJob, run_stage
 from learner.stages.oracle import Teacher, read_oracle
 from learner.stages.trainers import ORACLE_FILE

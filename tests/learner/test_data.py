@@ -9,10 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learner.data.augmentation import draw_turns, turn_facts
-from learner.data.dataset import Dataset, load_dataset, split
-from learner.data.privileged import WAY_WIDTH, WAYS_WIDTH, HiddenColumns, facts_of
-from learner.data.sampling import Batch, order_rows
+from learner.data.dataset import WAY_WIDTH, WAYS_WIDTH, Dataset, HiddenColumns, facts_of, load_dataset
+from learner.data.sampling import Batch, draw_turns, order_rows, split, turn_facts
 from learner.metrics import area_under_roc, best_f_score, calibration_error, discrimination, f_score
 from learner.settings import AugmentationConfig
 from learner.training.losses import (

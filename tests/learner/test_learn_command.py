@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from cluster.cli.main import run
 from learner.alternation import Collect, alternate
-from learner.data.dataset import kept_for_validation, load_dataset, split
+from learner.data.dataset import load_dataset
+from learner.data.sampling import kept_for_validation, split
 from learner.rounds import Following, Pace, publish
 from learner.settings import PUBLISHED_FILE, AlternationConfig
 from learner.stages.jobs import DONE_FILE, StageJob

@@ -11,9 +11,9 @@ import torch
 from cluster.config.campaign_config import CampaignConfig
 from cluster.runs.run_folder import RunFolder
 from cluster.runs.warm_start import warm_start, with_needed_depth
-from learner.data.augmentation import draw_flips
 from learner.data.dataset import load_dataset
 from learner.data.features import FrozenFeatures, ProposalPool
+from learner.data.sampling import draw_flips
 from learner.settings import AugmentationConfig, LearnerConfig
 from learner.stages.jobs import StageJob, run_stage
 from shared.config import CameraConfig, CollectionConfig

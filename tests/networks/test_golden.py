@@ -16,9 +16,8 @@ from torch import Tensor, nn
 from shared.networks.aap import Aap, OracleEncoder
 from shared.networks.actions import orthonormal_frames
 from shared.networks.aip import Aip
-from shared.networks.grouping import group_cloud
 from shared.networks.network_config import NetworkConfig
-from shared.networks.pointnet2 import CloudBatch
+from shared.networks.pointnet2 import CloudBatch, group_cloud
 from shared.networks.prior import Prior
 from shared.policies.where2act_adaptation import Where2ActAdaptation
 from tests.support.small_networks import TINY

@@ -25,10 +25,9 @@ from shared.networks.actions import (
     outcome_width,
     without_details,
 )
-from shared.networks.grouping import Grouping, group_cloud, nearest_points
 from shared.networks.layers import Head, point_features
 from shared.networks.network_config import NETWORKS, NetworkConfig
-from shared.networks.pointnet2 import CloudBatch, PointNet2, surroundings
+from shared.networks.pointnet2 import CloudBatch, Grouping, PointNet2, group_cloud, nearest_points, surroundings
 from shared.networks.prior import Prior
 from shared.types import OutcomeKind
 from tests.support.small_networks import TINY

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from learner.data.augmentation import flip_frames, turn_frames
+from learner.data.sampling import flip_frames, turn_frames
 from shared.geometry import gripper_rotation
 from shared.networks.actions import FRAME_WIDTH, swapped_fingers, turned_over
 from shared.networks.layers import ActionEncoder

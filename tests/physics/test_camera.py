@@ -8,7 +8,7 @@ import pytest
 from collector.sim.camera import DepthImage, EmbreeCamera, observation_from
 from shared.config import CameraConfig
 from shared.geometry import camera_pose
-from shared.observation import round_normals, round_points
+from shared.types import round_normals, round_points
 from tests.support.single_door import door, drawer
 
 CONFIG = CameraConfig(points=512, candidates=4000)

@@ -14,12 +14,12 @@ import zarr
 from benchmarks.storing import StoringBenchmark
 from cluster.cli.main import run
 from shared.errors import StoreError, UsageError
-from shared.observation import pack_normals
 from shared.plan import Job, Plan
 from shared.store import Store, compact, export, merge, verify
 from shared.store.codecs.observations import ARRAYS
 from shared.store.maintenance.export import splits_by_share
 from shared.store.maintenance.formats import plain
+from shared.types import pack_normals
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting, identical
 from tests.support.faults import Fault, disk_faults
 

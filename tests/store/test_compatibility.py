@@ -4,9 +4,7 @@ import dataclasses
 import hashlib
 import json
 import logging
-import shutil
 import tarfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +15,13 @@ import pytest
 from cluster.cli.main import run
 from collector.setting import in_fidelity_of
 from shared.config import CollectionConfig, Fidelity
-from shared.errors import SchemaVersionError, StoreError, UsageError
+from shared.errors import SchemaVersionError, StoreError
 from shared.io.documents import with_checksum, without_checksum
 from shared.plan import Job, Plan, RolloutStatus
-from shared.store import Store, compact, export, info, merge, migrate, repair, verify
+from shared.store import Store, compact, export, info, merge, repair, verify
 from shared.store.codecs.columns import ROLLOUT_COLUMNS, Column
 from shared.store.codecs.tables import read_table
 from shared.store.layout import Quarantined
-from shared.store.maintenance import migration
 from shared.store.maintenance.export import splits_by_share
 from shared.store.provenance import changed_versions
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting
@@ -295,95 +292,3 @@ def test_a_store_says_which_software_began_it_and_what_differs(tmp_path: Path) -
     assert changed_versions(software) == ""
     edit(store.path / "store.json", software=software | {"numpy": "0.1", "git_commit": "0" * 40})
     assert changed_versions(Store.open(store.path).document.software) == f"numpy 0.1 (now {software['numpy']})"
-
-
-@pytest.fixture
-def older(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A schema version 0 that never was: manifests said "cloud_size", and rollouts.parquet had no fidelity."""
-
-    def shard(files: dict[str, bytes], manifest: dict[str, Any]) -> tuple[dict[str, bytes], dict[str, Any]]:
-        table = pq.read_table(pa.BufferReader(files["rollouts.parquet"]))
-        place = [column.name for column in ROLLOUT_COLUMNS].index("fidelity")
-        fidelity = next(column for column in ROLLOUT_COLUMNS if column.name == "fidelity")
-        sink = pa.BufferOutputStream()
-        pq.write_table(
-            table.add_column(place, fidelity.field, pa.array(["fast"] * len(table))), sink, use_dictionary=False
-        )
-        manifest["points"] = manifest.pop("cloud_size")
-        return files | {"rollouts.parquet": sink.getvalue().to_pybytes()}, manifest
-
-    monkeypatch.setitem(migration.STEPS, 0, migration.MigrationStep(lambda _, content: content, shard))
-    yield
-
-
-def make_older(path: Path) -> str:
-    """A store of that version; returns the digest that it must have."""
-    store = make(path, 3)
-    store.publish_policy(1, {"policy.json": b"{}"})
-    digest = store.digest()
-    for folder in shards_of(store):
-        table = pq.read_table(folder / "rollouts.parquet").drop_columns(["fidelity"])
-        pq.write_table(table, folder / "rollouts.parquet", use_dictionary=False)
-        data = (folder / "rollouts.parquet").read_bytes()
-        manifest = without_checksum((folder / "manifest.json").read_bytes(), "manifest")
-        manifest["files"]["rollouts.parquet"] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-        manifest["cloud_size"] = manifest.pop("points")
-        (folder / "manifest.json").write_bytes(with_checksum(manifest | {"schema_version": 0}))
-    for file in (path / "store.json", path / "policies/000001/index.json"):
-        edit(file, schema_version=0)
-    return digest
-
-
-def test_an_older_store_is_migrated_and_goes_on_after_an_interruption(
-    older: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    digest = make_older(tmp_path / "old")
-    before = contents(tmp_path / "old")
-    assert run(["store", "info", str(tmp_path / "old")]) == 2
-    assert "store migrate" in capsys.readouterr().err
-    real, calls = migration._migrate_shard, []
-
-    def failing(*args: Any) -> None:
-        calls.append(args)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        real(*args)
-
-    monkeypatch.setattr(migration, "_migrate_shard", failing)
-    with pytest.raises(KeyboardInterrupt):
-        migrate(tmp_path / "old", tmp_path / "new")
-    with pytest.raises(StoreError, match="is no store"):
-        Store.open(tmp_path / "new")
-    assert run(["store", "migrate", str(tmp_path / "old"), "--out", str(tmp_path / "new")]) == 0
-    assert len(calls) == 4, "what was done before is not done again"
-    new = Store.open(tmp_path / "new")
-    assert new.digest() == digest
-    assert verify(new) == []
-    assert new.policy_versions() == (1,)
-    assert contents(tmp_path / "old") == before
-    assert run(["store", "migrate", str(tmp_path / "old"), "--out", str(tmp_path / "new")]) == 0
-    assert len(calls) == 4
-
-
-def test_what_cannot_be_migrated_is_refused(older: None, tmp_path: Path) -> None:
-    current = make(tmp_path / "current")
-    with pytest.raises(UsageError, match="nothing to migrate"):
-        migrate(current.path, tmp_path / "new")
-    edit(current.path / "store.json", schema_version=5)
-    with pytest.raises(SchemaVersionError, match="newer"):
-        migrate(current.path, tmp_path / "new")
-    edit(current.path / "store.json", schema_version=-1)
-    with pytest.raises(SchemaVersionError, match="no migration leads"):
-        migrate(current.path, tmp_path / "new")
-    assert not (tmp_path / "new").exists()
-    make_older(tmp_path / "old")
-    make_older(tmp_path / "other")
-    edit(tmp_path / "other/store.json", created="another day")
-    migrate(tmp_path / "old", tmp_path / "new")
-    with pytest.raises(StoreError, match="of another store"):
-        migrate(tmp_path / "other", tmp_path / "new")
-    shard = next((tmp_path / "other/shards").glob("random*"))
-    (shard / "interactions.parquet").write_bytes(b"x")
-    with pytest.raises(StoreError, match="SHA-256"):
-        migrate(tmp_path / "other", tmp_path / "third")
-    shutil.rmtree(tmp_path / "third")

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from shared.errors import StoreError, UsageError
 from shared.io import files
-from shared.observation import pack_normals, round_normals, round_points, unpack_normals
+from shared.types import pack_normals, round_normals, round_points, unpack_normals
 
 
 def test_writing_replaces_the_whole_content_and_leaves_nothing_else(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.depth import DepthMap
 from shared.geometry import camera_pose, gripper_rotation
 from shared.io.documents import with_checksum
-from shared.observation import round_normals, round_points
 from shared.plan import InteractionRecord, Job, ObjectRef, Plan, RolloutRecord, RolloutStatus, Setting
 from shared.store import Store
 from shared.store.codecs.columns import INTERACTION_COLUMNS, ROLLOUT_COLUMNS, InteractionRow, RolloutRow
@@ -33,6 +32,8 @@ from shared.types import (
     Outcome,
     OutcomeKind,
     Role,
+    round_normals,
+    round_points,
 )
 
 

@@ -25,7 +25,8 @@ from cluster.runs.run_folder import RunFolder, find
 from cluster.runs.run_log import RunLog
 from cluster.runs.status_snapshot import snapshot_of
 from learner.alternation import best_score, trained_in
-from learner.data.dataset import load_dataset, read_object_list
+from learner.data.dataset import load_dataset
+from learner.data.sampling import read_object_list
 from learner.rounds import _published, _read_snapshot
 from learner.stages.jobs import objects_seen
 from learner.training.checkpoint import Cursor, read_checkpoint, read_cursor, write_checkpoint

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from learner.data.dataset import Dataset, Split
+from learner.data.dataset import Dataset
+from learner.data.sampling import Split
 from learner.settings import (
     AapConfig,
     AffordanceConfig,

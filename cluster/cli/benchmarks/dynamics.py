@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from collector.domain_randomisation import draw_dynamics, draw_rollout, object_of
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import load_ref
 from collector.random_proposer import RandomProposer, RepeatingProposer
-from collector.recorder import interact
-from collector.rollout import make_environment
+from collector.rollout import draw_dynamics, draw_rollout, interact, make_environment, object_of
 from collector.sim.environment import SAME_STATE, SapienEnvironment, only_sapien
 from collector.stopwatch import StageClock
 from shared import seeds

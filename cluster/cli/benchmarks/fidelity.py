@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from collector.domain_randomisation import draw_rollout, object_of
 from collector.objects.catalogue import load_ref
 from collector.random_proposer import RandomProposer
-from collector.recorder import interact
-from collector.rollout import make_environment
+from collector.rollout import draw_rollout, interact, make_environment, object_of
 from collector.sim.environment import SapienEnvironment, only_sapien
 from collector.sim.trial import MOTION_THRESHOLD, Trial
 from collector.stopwatch import StageClock

@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 
-from learner.data.dataset import Dataset, Split, load_dataset, split
+from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import FrozenAap, FrozenFeatures
+from learner.data.sampling import Split, split
 from learner.settings import LearnerConfig, TrainingConfig
 from learner.stages.aap import AapStage, OracleStage
 from learner.stages.aip import AipStage

@@ -50,7 +50,7 @@ class LearnerCommand:
 
     def job(self, stage: "StageName" = "prior", init: Path | None = None) -> "StageJob":
         """What is trained on."""
-        from learner.data.dataset import read_object_list
+        from learner.data.sampling import read_object_list
         from learner.stages.jobs import StageJob
 
         train, validation = read_object_list(self.train_objects), read_object_list(self.validation_objects)

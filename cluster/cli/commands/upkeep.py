@@ -1,4 +1,4 @@
-"""`adaafford store repair|compact|merge|export|migrate`: what makes stores out of stores."""
+"""`adaafford store repair|compact|merge|export`: what makes stores out of stores."""
 
 import json
 from collections.abc import Callable
@@ -72,18 +72,6 @@ class ExportCommand(StoreCommand):
     push: str = ""
     """USER/NAME of a data set on the Hugging Face Hub to put the files into; needs huggingface_hub, and HF_TOKEN in the
     environment."""
-
-
-@dataclass(frozen=True, slots=True)
-class MigrateCommand:
-    """Write a store of an older schema version anew under the current one. The same command again goes on."""
-
-    store: Annotated[str, tyro.conf.Positional]
-    """Folder or s3:// URL of the old store, which stays as it is."""
-    out: str
-    """Folder or s3:// URL of the new store."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print one JSON object instead of text."""
 
 
 def _writing(execute: Callable[[Any], int]) -> Callable[[Any], int]:
@@ -175,7 +163,7 @@ def _merge(command: MergeCommand) -> int:
 
 
 def _export(command: ExportCommand) -> int:
-    from learner.data.dataset import read_object_list
+    from learner.data.sampling import read_object_list
     from shared.store import Store, export
     from shared.store.maintenance.export import splits_by_share
 
@@ -205,23 +193,9 @@ def _export(command: ExportCommand) -> int:
     return 0
 
 
-def _migrate(command: MigrateCommand) -> int:
-    from shared.store import migrate
-
-    with Progress(f"migrating into {command.out}, shards") as progress:
-        done = migrate(command.store, command.out, progress.show)
-    if command.json:
-        print(json.dumps(asdict(done), indent=2))
-        return 0
-    print(f"{done.shards} shards of schema version {done.version} written anew, digest {done.digest}")
-    print(f"into {command.out}; {command.store} stays as it is")
-    return 0
-
-
 ACTIONS: dict[str, Action] = {
     "repair": (RepairCommand, _writing(_repair)),
     "compact": (CompactCommand, _writing(_compact)),
     "merge": (MergeCommand, _writing(_merge)),
     "export": (ExportCommand, _writing(_export)),
-    "migrate": (MigrateCommand, _writing(_migrate)),
 }

@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from learner.data.dataset import Dataset, Split
+from learner.data.dataset import Dataset
 from learner.data.features import FrozenFeatures, FrozenPrior
-from learner.data.sampling import draw, order_rows, spread
+from learner.data.sampling import Split, draw, order_rows, spread
 from learner.settings import TrainingConfig
 from learner.stages.trainers import BaselineTraining, Load, StageTrainer
 from learner.training.data_parallel import share

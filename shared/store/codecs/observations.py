@@ -23,8 +23,16 @@ from shared.depth import DepthMap, pack_steps, unpack_steps
 from shared.errors import StoreError
 from shared.io.documents import parse_object
 from shared.io.text import plain
-from shared.observation import NORMAL_STEPS, pack_normals, round_normals, round_points, unpack_normals
-from shared.types import Float, Float32, Observation
+from shared.types import (
+    NORMAL_STEPS,
+    Float,
+    Float32,
+    Observation,
+    pack_normals,
+    round_normals,
+    round_points,
+    unpack_normals,
+)
 
 MAX_CHUNK_BYTES = 64 << 20
 MAX_METADATA_BYTES = 1 << 16
@@ -182,9 +190,9 @@ def check_observation(observation: Observation, points: int) -> None:
         if field.dtype.kind == "f" and not np.isfinite(field).all():
             raise ValueError(f"observation's {array.name} holds a number that is not finite")
     if not np.array_equal(observation.points, round_points(observation.points)):
-        raise ValueError("observation's points are not rounded to float16 (see shared.observation)")
+        raise ValueError("observation's points are not rounded to float16 (see shared.types)")
     if not np.array_equal(observation.normals, round_normals(observation.normals)):
-        raise ValueError("observation's normals are not rounded (see shared.observation)")
+        raise ValueError("observation's normals are not rounded (see shared.types)")
     if pixels and not fields["focal"] > 0:
         raise ValueError(f"observation's focal length is {fields['focal']}; it is positive")
     if pixels and not np.array_equal(_depth_map(observation).world_from_camera, observation.world_from_camera):

@@ -1,1 +1,1 @@
-"""What looks after a store: verify, repair, compact, merge, export, migrate, info."""
+"""What looks after a store: verify, repair, compact, merge, export, info."""
