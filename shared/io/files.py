@@ -448,6 +448,12 @@ def remove_if_abandoned(path: Path) -> bool:
     return True
 
 
+def remove_remnants(folder: Path) -> None:
+    """Remove the temporary files and folders in `folder` whose writers are dead (see `remove_if_abandoned`)."""
+    for remnant in folder.glob(f"{TEMPORARY_PREFIX}*"):
+        remove_if_abandoned(remnant)
+
+
 def is_abandoned(path: Path, process: str, after_s: float) -> bool:
     """Whether the process that made a file has ended, or may only be judged by the file, which is older than that."""
     match = _PROCESS_NAME.fullmatch(process)
