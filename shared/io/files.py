@@ -20,7 +20,7 @@ import socket
 import stat
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -463,7 +463,9 @@ def remove_if_abandoned(path: Path) -> bool:
 def remove_remnants(folder: Path) -> None:
     """Remove the temporary files and folders in `folder` whose writers are dead (see `remove_if_abandoned`)."""
     for remnant in folder.glob(f"{TEMPORARY_PREFIX}*"):
-        remove_if_abandoned(remnant)
+        # Those of other users may not be removable, which is no reason not to work here.
+        with suppress(OSError):
+            remove_if_abandoned(remnant)
 
 
 def is_abandoned(path: Path, process: str, after_s: float) -> bool:
