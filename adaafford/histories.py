@@ -30,7 +30,7 @@ from adaafford.scans import ScanFrame, Vector, action_at
 from shared.config import StrictModel
 from shared.errors import UsageError
 from shared.io.documents import named_twice
-from shared.io.files import read_bounded, write_atomically, writing
+from shared.io.files import read_bounded, remove_remnants, write_atomically, writing
 from shared.types import MAX_GRASP_WIDTH, Action, Interaction, Observation, Outcome, OutcomeKind
 
 MAX_HISTORY_BYTES = 1 << 20
@@ -242,6 +242,7 @@ def write_history(path: Path, history: History) -> None:
         UsageError: the folder is not writable.
     """
     with writing(path):
+        remove_remnants(path.parent)
         write_atomically(path, history.model_dump_json(indent=2).encode() + b"\n")
 
 

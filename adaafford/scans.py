@@ -323,8 +323,10 @@ def observation_of(scan: Scan, frame: ScanFrame, seed: int = 0, points: int = PO
         points: N; as many as the policy was trained with.
 
     Raises:
-        UsageError: no point that is kept may be acted upon, or the camera stands in the object.
+        UsageError: no point is kept, or none that may be acted upon, or the camera stands in the object.
     """
+    if points < 1:
+        raise UsageError(f"points={points}: give how many points of the scan are kept, as many as in training")
     world_from_camera, rng = frame.world_from_camera, seeds.generator(seed, "scan")
     kept = furthest_first(scan.points, points, max(CANDIDATES, points), rng)
     places = frame.to_world(scan.points[kept])

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError, m
 
 from shared.errors import UsageError
 from shared.extensions import Registry
-from shared.hidden import ALWAYS_DRAWN, HIDDEN_PARAMETERS, NAME, HiddenParameter
+from shared.hidden import ALWAYS_DRAWN, HIDDEN_PARAMETERS, NAME, HiddenParameter, hidden_parameter
 from shared.io.documents import MAX_PROBLEMS
 from shared.io.files import read_named
 from shared.io.text import MAX_WORD, plain
@@ -194,6 +194,16 @@ class DynamicsRanges(RootModel[dict[Annotated[str, Field(pattern=NAME)], Range]]
         names = [*ALWAYS_DRAWN, *sorted(given.keys() - ALWAYS_DRAWN.keys())]
         ranges = {name: given.get(name, {}) for name in names}
         return {n: _proposed(HIDDEN_PARAMETERS.get(n)) if value == {} else value for n, value in ranges.items()}
+
+    @model_validator(mode="after")
+    def _possible(self) -> "DynamicsRanges":
+        for name, given in self.root.items():
+            parameter = hidden_parameter(name)
+            if parameter is not None and parameter.least is not None and given.low < parameter.least:
+                raise ValueError(
+                    f"{name} needs a range from {parameter.least:g} on; given {given.low:g} to {given.high:g}"
+                )
+        return self
 
     def __getitem__(self, name: str) -> Range:
         """The range of one parameter."""

@@ -83,6 +83,7 @@ class HiddenParameter:
         apply: applies a value to a simulated object; called once for each rollout.
         default: the value of rows in stores without the parameter, which is the simulator's value if `apply` is not
             called. None: every store has it; only for the first three.
+        least: the least value that a range may have; None: any.
     """
 
     name: str
@@ -93,6 +94,7 @@ class HiddenParameter:
     log: bool
     apply: Callable[[HiddenTarget, float], None]
     default: float | None = None
+    least: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse a record that no setting could hold."""
@@ -118,6 +120,7 @@ BUILT_IN = {
             high=0.5,
             log=True,
             apply=lambda target, value: target.set_part_mass(value),
+            least=0.0,
         ),
         HiddenParameter(
             name="joint_friction",
@@ -127,6 +130,7 @@ BUILT_IN = {
             high=2.0,
             log=True,
             apply=lambda target, value: target.set_joint_friction(value),
+            least=0.0,
         ),
         HiddenParameter(
             name="surface_friction",
@@ -136,6 +140,7 @@ BUILT_IN = {
             high=10.0,
             log=True,
             apply=lambda target, value: target.set_surface_friction(value),
+            least=0.0,
         ),
         HiddenParameter(
             name="catch_force",
@@ -146,6 +151,7 @@ BUILT_IN = {
             log=True,
             apply=lambda target, value: target.set_catch(value),
             default=0.0,
+            least=0.0,
         ),
         HiddenParameter(
             name="latch_travel",
@@ -156,6 +162,7 @@ BUILT_IN = {
             log=False,
             apply=lambda target, value: target.set_latch(travel=value),
             default=0.0,
+            least=0.0,
         ),
         HiddenParameter(
             name="latch_handle",
@@ -166,6 +173,7 @@ BUILT_IN = {
             log=False,
             apply=lambda target, value: target.set_latch(handle=value),
             default=0.0,
+            least=0.0,
         ),
     )
 }

@@ -11,8 +11,13 @@ from collections.abc import Iterator  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import pytest  # noqa: E402
+from hypothesis import HealthCheck, settings  # noqa: E402
 
 pytest.register_assert_rewrite("tests.support")
+
+# Hypothesis' own limits of time fail where other processes keep the processors busy.
+settings.register_profile("any-machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any-machine")
 
 OBJECTS_VARIABLE = "ADAAFFORD_OBJECTS"
 BESIDE = Path(__file__).parents[2] / "shared" / "partnet_mobility"

@@ -89,13 +89,16 @@ def simulated(
         arm: that carries the hand, as for `adaafford collect --collection.arm`; None: the hand flies.
 
     Raises:
-        UsageError: there is no such task, hand or arm, or no object of the task comes to rest in view of the camera.
+        UsageError: there is no such task, hand or arm, the seed is negative, or no object of the task comes to rest in
+            view of the camera.
     """
     require("adaafford.simulated", "collect", without=("ray",))
     from collector.simulated_objects import SimulatedObjects
 
     # Like a robot's scans, observations have all that the sensor measured, so any policy can be asked.
-    collection = CollectionConfig(gripper=gripper, arm=arm).keeping_depth()
+    collection = parse(CollectionConfig, {"gripper": gripper, "arm": arm}, "adaafford.simulated").keeping_depth()
+    if not 0 <= seed < 2**63:
+        raise UsageError(f"adaafford.simulated: seed {seed}; needs a whole number from 0 on, below 2**63")
     found = SimulatedObjects(Path(objects), task_of(task), collection)
     plan, first = found.plan(seed), 0
     while True:

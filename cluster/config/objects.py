@@ -44,10 +44,12 @@ def objects_for(
     if selection.objects is None:
         generate(built_in, dict.fromkeys(built_in_categories(task, selection.categories), per_category), seed)
     lists = lists if selection.object_list is None else (selection.object_list,)
-    catalogue = for_task(of_categories(scan(folder, *lists), categories), task)
+    found = scan(folder, *lists)
+    catalogue = for_task(of_categories(found, categories), task)
     if not catalogue.usable:
         why = f"; the first: {catalogue.refused[0][0]}: {catalogue.refused[0][1]}" if catalogue.refused else ""
         raise UsageError(f"{folder}: none of {len(catalogue.refused)} objects suits the task '{task.name}'{why}")
+    _say_refused(found)
     _say_notes(catalogue)
     return catalogue, folder
 
@@ -65,6 +67,15 @@ def require_same_objects(wanted: Iterable[ObjectRef], folder: Path) -> None:
             f"{folder}: {len(missing)} of the objects wanted are not there or have other content, such as "
             f"{short(missing[0])}; name the folder that holds the same files"
         )
+
+
+def _say_refused(found: Catalogue) -> None:
+    """Say which objects cannot be used for any task; that others are of no use for this one is as expected."""
+    for object_id, reason in found.refused[:MOST_NOTED]:
+        logger.warning("object %s cannot be used: %s", object_id, reason)
+    if len(found.refused) > MOST_NOTED:
+        more = len(found.refused) - MOST_NOTED
+        logger.warning("%d more objects cannot be used; `adaafford objects check` says why", more)
 
 
 def _say_notes(catalogue: Catalogue) -> None:

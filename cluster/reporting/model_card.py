@@ -13,7 +13,14 @@ from learner.alternation import trained_in
 from learner.stages.jobs import DONE_FILE, objects_seen, read_policy_folder
 from shared.config import PANDA, CollectionConfig
 from shared.errors import UsageError
-from shared.io.files import make_folder, read_bounded, write_atomically
+from shared.io.files import (
+    TEMPORARY_PREFIX,
+    make_folder,
+    read_bounded,
+    remove_remnants,
+    write_atomically,
+    writing,
+)
 from shared.io.text import markdown
 from shared.plan import ObjectRef
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
@@ -138,16 +145,23 @@ def check_export_folder(out: Path) -> None:
         UsageError: it does, or is no folder.
     """
     known = {WEIGHTS_FILE, POLICY_FILE, CARD_FILE, DONE_FILE}
-    if out.exists() and (not out.is_dir() or any(path.name not in known for path in out.iterdir())):
+
+    def foreign(name: str) -> bool:
+        # A kill leaves the temporary file of the file that was being written.
+        return name not in known and not name.startswith(TEMPORARY_PREFIX)
+
+    if out.exists() and (not out.is_dir() or any(foreign(path.name) for path in out.iterdir())):
         raise UsageError(f"{out}: holds something that is not an exported policy; name a new or an empty folder")
 
 
 def write_export(out: Path, files: Mapping[str, bytes]) -> None:
-    """Write the files of an exported policy; raises as `check_export_folder` does, or UsageError without a folder."""
+    """Write the files of an exported policy; raises as `check_export_folder` does, or UsageError where it cannot."""
     check_export_folder(out)
     make_folder(out)
-    for name, data in files.items():
-        write_atomically(out / name, data)
+    with writing(out, "correct this, or name another folder"):
+        remove_remnants(out)
+        for name, data in files.items():
+            write_atomically(out / name, data)
 
 
 def head(policy: Policy, files: Mapping[str, bytes], licence: str, precision: str = "half") -> str:

@@ -125,6 +125,11 @@ class ArticulatedObject:
         return boxes
 
 
+def ends_at_zero(lower: float, upper: float) -> bool:
+    """Whether limits end at 0 from below, as those of a joint that is closed at its upper limit do."""
+    return lower < -MIN_RANGE and abs(upper) <= MIN_RANGE
+
+
 def joint_motion(joint: Joint, position: float) -> Float:
     """[4, 4], where a joint at `position` takes the body from where position 0 has it."""
     motion = np.eye(4)

@@ -93,7 +93,8 @@ class ObjectFiles:
                 )
             raise ObjectError(f"{self.folder}: {short(name)} {what}") from None
         except (OSError, RuntimeError) as error:
-            reason = getattr(error, "strerror", None) or type(error).__name__
+            # Of a link that leads to itself, Python before 3.13 raises a RuntimeError.
+            reason = getattr(error, "strerror", None) or "Too many levels of symbolic links"
             raise ObjectError(f"{self.folder}: {short(name)} cannot be read ({reason})") from None
         for pattern, system, command in _POINTERS:
             if pattern.match(data):

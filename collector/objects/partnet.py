@@ -13,6 +13,7 @@ from urllib.parse import unquote
 
 from pydantic_core import from_json
 
+from collector.objects.articulation import ends_at_zero
 from collector.objects.files import ObjectFiles, add_framed
 from collector.objects.readers import MAX_WORD, Description
 from collector.objects.urdf_bodies import UrdfBodies, UrdfMeshes, joint_notes, listed
@@ -57,9 +58,19 @@ class PartNetReader:
             data = documents[name] if name in documents else found.load(name)
             if data is not None:
                 add_framed(digest, name.encode("utf-8", "surrogatepass"), data)
-        bodies = UrdfBodies(urdf, found, part_names(semantics, str(folder / SEMANTICS_FILE)), str(folder)).merged()
+        names = part_names(semantics, str(folder / SEMANTICS_FILE))
+        merging = UrdfBodies(urdf, found, names, str(folder))
+        bodies = merging.merged()
         notes = [] if urdf_file == URDF_FILE else [f"read from {urdf_file}"]
-        notes += [*found.notes(), *joint_notes(urdf, bodies)]
+        if unknown := [short(link) for link in names if link not in urdf.links]:
+            notes.append(f"{SEMANTICS_FILE} names links that are not there ({listed(unknown)})")
+        notes += [*found.notes(), *merging.notes(), *joint_notes(urdf, bodies)]
+        joints = [body.joint for body in bodies if body.joint is not None]
+        if backward := [short(joint.name) for joint in joints if ends_at_zero(joint.lower, joint.upper)]:
+            notes.append(
+                f"{len(backward)} of {len(joints)} joints have limits that end at 0, and the lower limit is taken for "
+                f"closed; if 0 is closed, `adaafford objects import` turns them round ({listed(backward)})"
+            )
         return Description(category, bodies, tuple(notes), digest.hexdigest())
 
 

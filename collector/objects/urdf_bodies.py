@@ -105,6 +105,8 @@ class _Growing:
     collisions: list[Mesh] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     """Mesh files that cannot be used."""
+    without_collision: list[str] = field(default_factory=list)
+    """Links that are seen and name nothing to collide with."""
 
     def body(self) -> Body:
         visuals = tuple(self.visuals)
@@ -114,7 +116,8 @@ class _Growing:
 class UrdfBodies:
     """Merges the links of a URDF into bodies: those that fixed joints tie together become one.
 
-    A body without collision meshes collides as it looks.
+    A body without collision meshes collides as it looks. A link without any does not, where another link of its body
+    has some: in published objects, simpler shapes for collision are in links that are fixed to the one that is seen.
     """
 
     def __init__(self, urdf: Urdf, found: UrdfMeshes, names: Mapping[str, str], where: str) -> None:
@@ -123,6 +126,16 @@ class UrdfBodies:
         self._where = where
         self._found = found
         self._vertices = 0
+        self._passable: list[str] = []
+
+    def notes(self) -> Iterator[str]:
+        """What of the shapes a user would not expect; after `merged`."""
+        if self._passable:
+            names = listed([short(name) for name in self._passable])
+            yield (
+                f"{len(self._passable)} of {len(self._urdf.links)} links are seen and do not collide, since only other "
+                f"links of the same part have a <collision> ({names})"
+            )
 
     def merged(self) -> tuple[Body, ...]:
         """Body 0 is the root; the others follow in the order of the URDF's joints.
@@ -151,12 +164,15 @@ class UrdfBodies:
                 mesh = body.lost[0]
                 why = f"{short(mesh)} {self._found.unusable[mesh]}"
                 raise ObjectError(f"{self._where}: the movable part {short(body.link)} keeps no shape: {why}")
+        self._passable = [link for body in bodies if body.collisions for link in body.without_collision]
         return tuple(body.body() for body in bodies)
 
     def _add_link(self, body: _Growing, name: str, body_from_link: Float) -> None:
         """Add the link's meshes to `body`; a mesh that is both seen and collided with is kept once."""
         link = self._urdf.links[name]
         kept: dict[tuple[object, ...], Mesh] = {}
+        if link.visuals and not link.collisions:
+            body.without_collision.append(name)
         for shapes, meshes_of_body in ((link.visuals, body.visuals), (link.collisions, body.collisions)):
             for shape in shapes:
                 if shape.kind == "mesh" and self._found.get(shape.file) is None:

@@ -27,7 +27,7 @@ from learner.training.trackers import Trackers
 from shared.errors import UsageError
 from shared.formatting import finite
 from shared.io.documents import json_lines
-from shared.io.files import read_bounded
+from shared.io.files import read_bounded, remove_remnants
 from shared.progress import Progress, minutes
 from shared.seeds import generator
 
@@ -270,6 +270,7 @@ class _Loop:
 
     def _resume(self) -> None:
         path = self.out / CHECKPOINT_FILE
+        remove_remnants(self.out)
         if path.exists():
             check_fingerprint(read_cursor(path), self.cursor.fingerprint, self.out)
             self.cursor, self.best = read_checkpoint(path, self.stage.module, self.optimiser)

@@ -20,7 +20,7 @@ import socket
 import stat
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -120,12 +120,23 @@ def sync_folder(path: Path) -> None:
 def write_atomically(path: Path, data: bytes) -> None:
     """Put `data` at `path`, replacing what was there: a reader finds the old bytes or the new, after any crash."""
     temporary = path.parent / temporary_name(path.name)
+    with _naming(path):
+        try:
+            write_durably(temporary, data)
+            temporary.rename(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+        sync_folder(path.parent)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors of the system name this file: by themselves they name a temporary one, or none if a disk is full."""
     try:
-        write_durably(temporary, data)
-        temporary.rename(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    sync_folder(path.parent)
+        yield
+    except OSError as error:
+        error.filename = str(path)
+        raise
 
 
 def create_exclusively(path: Path, data: bytes) -> bool:
@@ -135,13 +146,14 @@ def create_exclusively(path: Path, data: bytes) -> bool:
         Whether this call made the file.
     """
     temporary = path.parent / temporary_name(path.name)
-    try:
-        write_durably(temporary, data)
-        made = _take_name(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    if made:
-        sync_folder(path.parent)
+    with _naming(path):
+        try:
+            write_durably(temporary, data)
+            made = _take_name(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+        if made:
+            sync_folder(path.parent)
     return made
 
 
@@ -446,6 +458,14 @@ def remove_if_abandoned(path: Path) -> bool:
         return False
     remove_tree(path)
     return True
+
+
+def remove_remnants(folder: Path) -> None:
+    """Remove the temporary files and folders in `folder` whose writers are dead (see `remove_if_abandoned`)."""
+    for remnant in folder.glob(f"{TEMPORARY_PREFIX}*"):
+        # Those of other users may not be removable, which is no reason not to work here.
+        with suppress(OSError):
+            remove_if_abandoned(remnant)
 
 
 def is_abandoned(path: Path, process: str, after_s: float) -> bool:

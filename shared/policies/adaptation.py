@@ -327,6 +327,11 @@ class Adapter:
         # By value, because a robot's interactions may be read anew at each step.
         key = module, action.point_index, action.rotation.tobytes(), repr(outcome)
         if key not in codes:
+            if not 0 <= outcome.motion < np.inf:
+                # Networks make NaN of it, and of all that they predict with it.
+                raise UsageError(
+                    f"an outcome has the motion {outcome.motion:g}; give how far the part moved, 0 or more"
+                )
             index = np.array([action.point_index])
             codes[key] = self._adaptive(module).interaction_codes(
                 self.features(observation, module, index),

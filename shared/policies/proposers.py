@@ -117,7 +117,13 @@ class ExploitProposer:
 
 
 def points_of(share: float, observation: Observation) -> int:
-    """How many points a share of a cloud is, at least one; of all points, because the published 100 are of 10,000."""
+    """How many points a share of a cloud is, at least one; of all points, because the published 100 are of 10,000.
+
+    Raises:
+        UsageError: it is no share.
+    """
+    if not 0 < share <= 1:
+        raise UsageError(f"share={share}: give more than 0 and at most 1 of a cloud's points")
     return max(1, round(share * len(observation.points)))
 
 

@@ -29,6 +29,7 @@ from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.types import Action, Float, OutcomeKind
 from tests.support.fabricate import fabricate_observation
 from tests.support.finished_run import make_finished_run
+from tests.support.killed_writers import kill_while_writing
 
 NETWORK = NetworkConfig(
     centres=(32, 8), radii=(0.3, 0.8), neighbours=4, abstraction=((8,), (16,)), propagation=((16,), (16,)),
@@ -138,6 +139,13 @@ def test_a_history_comes_back(tmp_path: Path) -> None:
     )  # fmt: skip
     write_history(tmp_path / "history.json", history)
     assert read_history(tmp_path / "history.json") == history
+
+
+def test_a_session_that_was_killed_leaves_nothing_to_the_next(tmp_path: Path) -> None:
+    history = tmp_path / "history.json"
+    kill_while_writing(history)
+    write_history(history, History(frame=ScanFrame(origin=(0.9, 0.0, 0.0))))
+    assert list(tmp_path.iterdir()) == [history]
 
 
 @pytest.mark.parametrize(

@@ -114,6 +114,20 @@ def test_without_a_movable_point_nothing_is_proposed(adapter: Adapter) -> None:
         AipProposer(adapter, np.random.default_rng(0), budget=1).propose(still, [])
 
 
+@pytest.mark.parametrize("motion", [float("nan"), float("inf"), -0.1])
+def test_an_outcome_that_is_no_motion_is_refused(adapter: Adapter, motion: float) -> None:
+    (tried,) = history_of(observation_of(), 1)
+    wrong = dataclasses.replace(tried, outcome=dataclasses.replace(tried.outcome, motion=motion))
+    with pytest.raises(UsageError, match=f"the motion {motion:g};"):
+        adapter.affordance(tried.observation, [wrong])
+
+
+@pytest.mark.parametrize("share", [0.0, 1.01, float("nan")])
+def test_what_is_no_share_is_refused(adapter: Adapter, share: float) -> None:
+    with pytest.raises(UsageError, match="share="):
+        ExploitProposer(adapter, np.random.default_rng(0), share=share).propose(observation_of(), [])
+
+
 def test_untrained_policies_are_refused() -> None:
     with pytest.raises(UsageError, match="not trained"):
         AipProposer(Adapter(Policy.untrained("push", TINY, 0)), np.random.default_rng(0), budget=1)

@@ -131,7 +131,6 @@ def test_a_cloud_that_contradicts_itself_is_refused(wrong: dict[str, Any], expec
 NUMBER = st.sampled_from([0, 1, 2, 12, 48, 240, 2880, (1 << 31) - 1, (1 << 32) - 1])
 
 
-@settings(deadline=None)
 @given(NUMBER, NUMBER, NUMBER, NUMBER, NUMBER, st.integers(0, 9))
 def test_no_numbers_of_a_cloud_raise_anything_but_a_value_error(
     height: int, width: int, step: int, row: int, offset: int, kind: int
@@ -280,7 +279,7 @@ def test_what_is_no_recording_is_refused_in_one_line(tmp_path: Path, capsys: pyt
     assert not (tmp_path / "h.json").exists()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(place=st.integers(0, 1 << 16), value=st.integers(0, 255), cut=st.booleans(), mcap=st.booleans())
 def test_a_damaged_recording_raises_and_never_hangs(
     tmp_path_factory: pytest.TempPathFactory, place: int, value: int, cut: bool, mcap: bool

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Iterator
 from itertools import count, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -254,3 +255,16 @@ def test_noise_has_the_deviation_that_was_measured_and_leaves_pixels_out_at_edge
     assert LEVEL_M < deviation < 1.3 * LEVEL_M
     rays = (seen.points - place) / seen.depths[:, None]
     np.testing.assert_allclose(rays @ pose[:3, 0], 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"gripper": "Panda Hand"}, "setting 'gripper'"),
+        ({"arm": "a" * 1001}, "setting 'arm'"),
+        ({"seed": -1}, "seed -1"),
+    ],
+)
+def test_simulated_objects_of_no_possible_setting_are_refused(objects: Path, settings: Any, said: str) -> None:
+    with pytest.raises(UsageError, match=f"adaafford.simulated: {said}"):
+        next(simulated(objects, TASK, **settings))

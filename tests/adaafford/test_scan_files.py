@@ -364,6 +364,12 @@ def test_points_that_were_not_measured_are_left_out_and_counted(missing: tuple[f
     assert missing_points(checked_scan(np.concatenate([front(400), np.zeros((10, 3))]))) is None
 
 
+def test_an_observation_without_points_is_refused() -> None:
+    scan = checked_scan(front(400))
+    with pytest.raises(UsageError, match="points=0"):
+        observation_of(scan, ScanFrame.around(scan), points=0)
+
+
 @pytest.mark.parametrize("missing", [0.0, np.nan, np.inf, 1e300])
 def test_a_normal_that_is_missing_is_estimated_and_its_point_stays(missing: float) -> None:
     points = front(400)
@@ -735,7 +741,7 @@ def test_many_mutants_are_read_or_refused(seed: int, tmp_path: Path) -> None:
     assert 0 < try_mutants(1000, 100 + seed, tmp_path) < 1000
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(kind=st.sampled_from(["ply", "pcd", "npz"]), place=st.integers(0, 400), byte=st.integers(0, 255))
 def test_a_flipped_byte_is_read_or_refused(kind: str, place: int, byte: int) -> None:
     whole = bytearray(WHOLE[kind][0])

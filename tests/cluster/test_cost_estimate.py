@@ -32,7 +32,7 @@ def stage(found: Estimate, name: str) -> StageCost:
     adopts=st.booleans(),
     methods=st.sets(st.sampled_from(METHODS.names()), min_size=1).map(sorted),
 )
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 def test_what_a_campaign_does_is_what_is_paid_for(alternations: int, adopts: bool, methods: list[str]) -> None:
     told = {"alternations": alternations + adopts, "start_from": "push-faucet" if adopts else None}
     config = CampaignConfig.model_validate({**told, "evaluation": {"methods": methods}})

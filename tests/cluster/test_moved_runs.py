@@ -20,6 +20,7 @@ from shared.errors import UsageError
 from shared.store import Store
 from shared.store.provenance import changed_versions
 from tests.support.finished_run import make_finished_run
+from tests.support.killed_writers import kill_while_writing
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *args: str) -> str:
@@ -158,7 +159,9 @@ def test_a_kill_before_the_configuration_was_written_leaves_a_folder_that_is_fre
     run = begin(tmp_path / "run", config)
     run.config.unlink()
     assert run.places.exists()
+    left = kill_while_writing(run.config)
     assert begin(run.path, config) == run
+    assert not left.exists()
     run.config.unlink()
     assert begin(run.path, CampaignConfig()) == run
     assert find(run.path)[1].objects is None

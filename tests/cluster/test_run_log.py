@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.runs.run_log import BEAT_SHARE, RunLog, pause_s
@@ -63,7 +63,6 @@ def test_wall_time_is_added_up_over_attempts(tmp_path: Path) -> None:
     assert run_log.result("b") == {"made": "b"} == RunLog(tmp_path / "log.jsonl").result("b")
 
 
-@settings(deadline=None)
 @given(cut=st.integers(min_value=0, max_value=2000))
 def test_a_torn_log_loses_at_most_its_last_line(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
     path = tmp_path_factory.mktemp("ledger") / "log.jsonl"

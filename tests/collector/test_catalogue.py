@@ -313,6 +313,21 @@ def test_what_is_left_out_is_said_before_collection(
     assert "left out: 'textured_objs/new-1.obj' is absent" in capsys.readouterr().out
 
 
+def test_objects_that_cannot_be_used_are_said_before_collection(
+    shelf: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.copytree(shelf / "box-0000", tmp_path / "objects/box-0000")
+    (tmp_path / "objects/half").mkdir()
+    (tmp_path / "objects/half/mobility.urdf").write_text("<robot>")
+    selection = ObjectSelection(objects=tmp_path / "objects")
+    with caplog.at_level(logging.WARNING):
+        catalogue, _ = objects_for(task_named("push"), selection, tmp_path / "none", 1, 1)
+    assert [entry.ref.id for entry in catalogue.usable] == ["box-0000"]
+    (line,) = caplog.messages
+    assert line.startswith("object half cannot be used: ")
+    assert "'meta.json' is missing" in line
+
+
 def test_hostile_names_of_folders_are_shown_as_escapes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "ok\n\x1b[2Jbox-0000  usable\u202e").mkdir()
     (tmp_path / "ok\n\x1b[2Jbox-0000  usable\u202e/mobility.urdf").write_text("<robot/>")

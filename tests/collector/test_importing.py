@@ -1,7 +1,10 @@
 """Importing objects: every kind of source becomes the same object, in its place, or is refused with one line."""
 
 import json
+import signal
 import struct
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -268,6 +271,17 @@ def test_a_broken_urdf_is_refused_and_nothing_is_left(
     assert printed.out.startswith("cabinet  refused: ")
     assert printed.out.count("\n") == 1
     assert not out.exists() or not list(out.iterdir())
+
+
+def test_an_import_that_was_killed_leaves_nothing_to_the_next(cabinet: Path, tmp_path: Path) -> None:
+    objects = tmp_path / "objects"
+    code = "import os, signal; from pathlib import Path; from collector.objects.importing import importer, layouts\n"
+    code += "importer.read_object = lambda folder: os.kill(os.getpid(), signal.SIGKILL)\n"
+    code += f"source = layouts.source_of(Path({str(cabinet)!r}))\n"
+    code += f"importer.import_object(source, Path({str(objects / 'mine')!r}), importer.ImportSettings())"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -signal.SIGKILL
+    assert [path.name.startswith(".tmp-") for path in objects.iterdir()] == [True]
+    assert [path.name for path in imported(cabinet, objects).folder.parent.iterdir()] == [cabinet.stem]
 
 
 def test_a_mimic_is_said(cabinet: Path, tmp_path: Path) -> None:

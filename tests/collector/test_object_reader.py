@@ -33,6 +33,7 @@ URDF = """<?xml version="1.0"?>
   </link>
   <link name="door">
     <visual><origin xyz="-1 0 0"/><geometry><mesh filename="textured_objs/cube.obj"/></geometry></visual>
+    <collision><origin xyz="-1 0 0"/><geometry><mesh filename="textured_objs/cube.obj"/></geometry></collision>
   </link>
   <link name="handle">
     <visual><geometry><cylinder radius="0.1" length="1"/></geometry></visual>
@@ -390,6 +391,39 @@ def test_joints_that_mimic_or_cannot_move_are_noted(folder: Path) -> None:
     still, mimic = read_object(folder).notes
     assert still == "1 of 2 joints cannot move, since both limits are the same ('turn')"
     assert mimic == "<mimic> is not followed: what has it moves on its own ('hinge' of 'lost')"
+
+
+def test_links_that_are_seen_and_do_not_collide_are_noted(folder: Path) -> None:
+    welded = '<joint name="weld2" type="fixed"><parent link="body"/><child link="trim"/></joint>'
+    trim = '<link name="trim"><visual><geometry><sphere radius="0.1"/></geometry></visual></link>'
+    edit(folder, "</robot>", f"{trim}{welded}</robot>")
+    described = read_object(folder)
+    assert [len(body.visuals) for body in described.bodies] == [2, 2, 1]
+    assert [len(body.collisions) for body in described.bodies] == [1, 2, 1]
+    (note,) = described.notes
+    assert note.startswith("1 of 6 links are seen and do not collide")
+    assert note.endswith("('trim')")
+
+
+def test_semantics_of_links_that_are_not_there_are_noted(folder: Path) -> None:
+    edit(folder, "lock hinge knob", "link_0 hinge knob", "semantics.txt")
+    described = read_object(folder)
+    assert described.bodies[2].part_name == ""
+    assert described.notes == ("semantics.txt names links that are not there ('link_0')",)
+
+
+def test_a_door_that_may_be_closed_at_its_upper_limit_is_noted(folder: Path) -> None:
+    edit(folder, 'lower="0" upper="1.5"', 'lower="-1.5" upper="0"')
+    (note,) = read_object(folder).notes
+    assert note.startswith("1 of 2 joints have limits that end at 0")
+    assert note.endswith("('hinge')")
+
+
+def test_a_link_that_leads_to_itself_is_called_so(folder: Path) -> None:
+    (folder / CUBE).unlink()
+    (folder / CUBE).symlink_to("cube.obj")
+    with pytest.raises(ObjectError, match="Too many levels of symbolic links"):
+        read_object(folder)
 
 
 def test_limits_that_are_nearly_the_same_are_called_so(folder: Path) -> None:

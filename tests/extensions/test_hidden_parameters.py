@@ -23,7 +23,7 @@ from learner.data.features import FrozenFeatures
 from learner.stages.jobs import StageJob, run_stage
 from learner.stages.oracle import Teacher, read_oracle
 from learner.stages.trainers import ORACLE_FILE
-from shared.config import FIDELITIES, DynamicsRanges, Range
+from shared.config import FIDELITIES, CollectionConfig, DynamicsRanges, Range, parse
 from shared.errors import StoreError, UsageError
 from shared.geometry import gripper_rotation
 from shared.hidden import ALWAYS_DRAWN, HiddenParameter
@@ -274,6 +274,12 @@ def test_a_flag_that_names_none_is_refused(word: str, tmp_path: Path, capsys: py
         assert ended.code == 2
     assert "Traceback" not in capsys.readouterr().err
     assert not store.exists()
+
+
+@pytest.mark.parametrize("name", ["part_mass", "joint_friction", "catch_force"])
+def test_a_range_that_physics_cannot_have_is_refused(name: str) -> None:
+    with pytest.raises(UsageError, match=f"{name} needs a range from 0 on; given -1 to 1"):
+        parse(CollectionConfig, {"dynamics": {name: {"low": -1.0, "high": 1.0}}}, "a file")
 
 
 @pytest.mark.parametrize("name", ["Wind", "wind speed", "direction", "values", ""])

@@ -8,6 +8,7 @@ import pytest
 
 from adaafford.pretrained import load_policy
 from cluster.cli.main import run
+from cluster.reporting.model_card import write_export
 from learner.calibration import (
     MIN_SCALE,
     STRENGTHS,
@@ -28,6 +29,7 @@ from shared.errors import UsageError
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.store.store import Store
 from shared.types import Float
+from tests.support.killed_writers import kill_while_writing
 from tests.support.small_policies import policy_of
 from tests.support.small_trainings import fabricated_plan, fabricated_rollouts, make_store
 
@@ -189,3 +191,11 @@ def test_what_cannot_be_calibrated_is_refused_in_one_line(
         assert expected in line
         assert line.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_an_export_that_was_killed_is_completed_by_the_next(tmp_path: Path) -> None:
+    out, files = tmp_path / "out", {WEIGHTS_FILE: b"weights", POLICY_FILE: b"{}"}
+    out.mkdir()
+    kill_while_writing(out / WEIGHTS_FILE)
+    write_export(out, files)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == files

@@ -102,7 +102,7 @@ def test_no_object_is_on_both_sides(dataset: Dataset) -> None:
 
 
 @given(st.integers(0, 10_000), st.integers(1, 14), st.integers(0, 9))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_context_and_questions_never_overlap(dataset: Dataset, seed: int, size: int, limit: int) -> None:
     ordered = order_rows(dataset, [0, 3, 3, 5], size, np.random.default_rng(seed))
     context = ordered.longest_context(limit)
@@ -224,7 +224,7 @@ def test_metrics_know_what_is_not_defined() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.booleans()), min_size=2, max_size=20))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_metrics_agree_with_trying_everything(rows: list[tuple[int, bool]]) -> None:
     scores, labels = np.array([s / 4 for s, _ in rows]), np.array([r for _, r in rows])
     if labels.any():

@@ -170,7 +170,7 @@ def test_nothing_to_wait_for_is_refused(capsys: pytest.CaptureFixture[str], tmp_
     assert "--more-rollouts must be above 0" in capsys.readouterr().err
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.lists(st.integers(1, 4), min_size=1, max_size=6), st.data())
 def test_a_snapshot_is_what_was_there_and_no_more(
     tmp_path_factory: pytest.TempPathFactory, sizes: list[int], data: st.DataObject

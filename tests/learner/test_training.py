@@ -43,13 +43,15 @@ from learner.stages.jobs import DONE_FILE, Memory, StageJob, read_policy_folder,
 from learner.stages.oracle import OracleCritic, Teacher
 from learner.stages.prior import PriorStage
 from learner.training.checkpoint import Cursor
-from learner.training.loop import Stage, StepResult, rate_factor, train
+from learner.training.loop import CHECKPOINT_FILE, Stage, StepResult, rate_factor, train
 from shared.errors import UsageError
+from shared.io.files import TEMPORARY_PREFIX
 from shared.networks.actions import outcome_details
 from shared.networks.network_config import NetworkConfig
 from shared.plan import InteractionRecord, RolloutRecord
 from shared.policies.policy import WEIGHTS_FILE, Policy
 from shared.types import Role
+from tests.support.killed_writers import kill_while_writing
 from tests.support.small_networks import TINY
 from tests.support.small_trainings import (
     EVERYTHING,
@@ -352,10 +354,12 @@ def test_a_killed_run_ends_with_the_bits_of_one_that_was_not(
             except KilledError:
                 with (out / METRICS_FILE).open("a", encoding="utf-8") as file:
                     file.write('{"step": 99')
+                kill_while_writing(out / CHECKPOINT_FILE)
                 continue
             weights.append(policy.to_files()[WEIGHTS_FILE])
         timeless = [json.loads(line) for line in (out / METRICS_FILE).read_text().splitlines()]
         lines.append([{k: v for k, v in line.items() if "second" not in k} for line in timeless])
+        assert not list(out.glob(f"{TEMPORARY_PREFIX}*"))
     assert weights[0] == weights[1]
     assert lines[0] == lines[1]
     assert [dataclasses.replace(r, seconds=0.0) for r in results[:1]] == [

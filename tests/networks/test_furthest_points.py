@@ -29,7 +29,7 @@ def assert_furthest(points: NDArray[np.float32], chosen: NDArray[np.int64]) -> N
         squared = np.minimum(squared, x * x + y * y + z * z)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 400), st.floats(0.0, 1.0), st.booleans(), st.integers(0, 2**32 - 1))
 def test_furthest_points_of_any_cloud_are_each_the_furthest(size: int, share: float, grid: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)

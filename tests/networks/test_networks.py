@@ -93,7 +93,7 @@ def test_head_is_one_layer_on_the_concatenation() -> None:
 
 
 @given(st.integers(0, 2**31 - 1))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_any_six_numbers_give_a_rotation(seed: int) -> None:
     raw = torch.randn(4, 6, generator=torch.Generator().manual_seed(seed))
     raw[1] = 0.0
@@ -140,7 +140,7 @@ def test_surroundings_are_the_nearest_points_and_turn_with_the_gripper() -> None
 
 
 @given(st.integers(1, 40), st.integers(0, 12), st.integers(0, 1000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_a_whole_clouds_surroundings_are_those_of_its_points(size: int, count: int, seed: int) -> None:
     points = torch.randn(1, size, 3, generator=torch.Generator().manual_seed(seed))
     around = nearest_points(cKDTree(points[0].numpy()), points[0].numpy(), count)
@@ -177,7 +177,7 @@ def codes(module: Aap, count: int, seed: int = 0) -> tuple[torch.Tensor, torch.T
 
 
 @given(st.integers(1, 12), st.integers(0, 1000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_latent_forgets_the_order(count: int, seed: int) -> None:
     module = Aap(TINY)
     z, w = codes(module, count, seed)

@@ -28,6 +28,7 @@ from shared.store.maintenance.formats import EXPORT_FORMATS, word
 from shared.store.maintenance.steps import Content, survey
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
 from tests.support.faults import Fault, disk_faults
+from tests.support.killed_writers import kill_while_writing
 
 SETTING = fabricate_setting(objects=3, points=64)
 PLANS = Plan(setting=SETTING), Plan(setting=SETTING, proposer="aip", policy_version=1)
@@ -373,7 +374,9 @@ def test_a_file_that_was_lost_of_an_unfinished_export_is_written_again(
     first = tmp_path / "out.unfinished/data/train-00000-of-00004.parquet"
     first.write_bytes(first.read_bytes()[:99])
     (tmp_path / "out.unfinished/.export/1.json").write_text("{")
+    left = kill_while_writing(tmp_path / "out.unfinished/README.md")
     export(store, tmp_path / "out", SPLITS, format="hf")
+    assert not (tmp_path / "out" / left.name).exists()
     assert sum(map(len, read_hf(tmp_path / "out").values())) == sum(map(len, expected(store).values()))
 
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from shared.errors import StoreError, UsageError
 from shared.io import files
 from shared.types import pack_normals, round_normals, round_points, unpack_normals
+from tests.support.killed_writers import kill_while_writing
 
 
 def test_writing_replaces_the_whole_content_and_leaves_nothing_else(tmp_path: Path) -> None:
@@ -33,8 +34,10 @@ def test_a_failed_write_leaves_the_old_content(tmp_path: Path, monkeypatch: pyte
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        files.write_atomically(path, b"new")
+    for write in (files.write_atomically, files.create_exclusively):
+        with pytest.raises(OSError, match="No space") as raised:
+            write(path, b"new")
+        assert raised.value.filename == str(path)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -118,6 +121,20 @@ def test_only_what_the_dead_left_is_removed(tmp_path: Path) -> None:
     reused.mkdir()
     assert [files.remove_if_abandoned(path) for path in (left, ours, other, reused)] == [True, False, False, True]
     assert sorted(tmp_path.iterdir()) == sorted([ours, other])
+
+
+def test_what_the_dead_left_and_cannot_be_removed_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    left = kill_while_writing(tmp_path / "a.json")
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(1, "Operation not permitted", str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(files, "remove_tree", refuse)
+        files.remove_remnants(tmp_path)
+        assert left.exists()
+    files.remove_remnants(tmp_path)
+    assert not left.exists()
 
 
 def test_removing_a_link_leaves_what_it_points_at(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ FINITE = st.floats(allow_nan=False, allow_infinity=False)
 TEXT = st.text(st.characters(blacklist_categories=["C", "Z"]), max_size=20)
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_numbers_and_texts_survive(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     base = fabricate_rollout(PLAN, 0, interactions=2)
@@ -108,7 +108,7 @@ def digest_of_twelve(tmp_path_factory: pytest.TempPathFactory) -> str:
     return make(tmp_path_factory.mktemp("whole"), (0, 12)).digest()
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(cuts=st.sets(st.integers(1, 11)), order=st.randoms())
 def test_the_digest_does_not_depend_on_grouping_or_order(
     tmp_path_factory: pytest.TempPathFactory, digest_of_twelve: str, cuts: set[int], order: Any

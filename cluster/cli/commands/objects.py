@@ -13,6 +13,7 @@ from shared.errors import UsageError
 from shared.io.text import plain
 
 Direction = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 if TYPE_CHECKING:
     from collector.objects.catalogue import CatalogueEntry
@@ -51,9 +52,9 @@ class ImportCommand:
     Articulate-Anything, -x of others."""
     up: Direction = "+z"
     """Direction, in the file, that is up."""
-    scale: Annotated[float, Field(gt=0)] | None = None
+    scale: Positive | None = None
     """Multiply all lengths by this instead of giving the object a size."""
-    size: Annotated[float, Field(gt=0)] | None = None
+    size: Positive | None = None
     """Diagonal of the object's bounding box afterwards; 2, as that of published objects, unless given."""
     search_path: tuple[Path, ...] = ()
     """Folders, beside that of the file, where meshes and included files may be."""
@@ -77,7 +78,7 @@ class ExportCommand:
     """Of the main file, which is called mobility.urdf or object.xml."""
     collision: Literal["hulls", "decomposed"] = "hulls"
     """As of a collection: one convex hull a mesh, or several pieces that keep cavities open."""
-    part_mass: Annotated[float, Field(gt=0)] = 0.16
+    part_mass: Positive = 0.16
     """kg, of each movable part; a collection draws it anew for each rollout, from 0.05 to 0.5 unless told otherwise."""
 
 

@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from pydantic_core import from_json
@@ -21,7 +20,7 @@ from collector.objects.urdf_bodies import listed
 from collector.objects.writing import write_object
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.extras import require_packages
-from shared.io.files import TEMPORARY_PREFIX, read_bounded, remove_tree, writing
+from shared.io.files import read_bounded, remove_remnants, remove_tree, temporary_name, writing
 from shared.io.text import plain, short
 
 MAX_META_BYTES = 1 << 20
@@ -137,14 +136,18 @@ def _write(folder: Path, model: ObjectModel, source: Source) -> ArticulatedObjec
     meta = {IMPORTED: {"file": source.file.name, "layout": source.layout, "sha256": digest}}
     with writing(folder, "name a folder that can"):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=folder.parent) as scratch:
-            written = write_object(Path(scratch) / folder.name, model, meta)
+        remove_remnants(folder.parent)
+        scratch = folder.parent / temporary_name(folder.name)
+        try:
+            written = write_object(scratch / folder.name, model, meta)
             try:
                 judged = read_object(written)
             except ObjectError as error:
                 raise ObjectError(str(error).replace(str(written), str(source.file))) from None
             remove_tree(folder)
             written.rename(folder)
+        finally:
+            remove_tree(scratch)
     return judged
 
 

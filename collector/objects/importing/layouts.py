@@ -90,9 +90,10 @@ def read_urdf(source: Source, files: SourceFiles, root: str | None = None) -> De
     if beside.exists(SEMANTICS_FILE):
         said = part_names(beside.read(SEMANTICS_FILE, MAX_TEXT_BYTES), str(source.file.parent / SEMANTICS_FILE))
         names = {**said, **names}
-    bodies = UrdfBodies(urdf, found, names, where).merged()
+    merging = UrdfBodies(urdf, found, names, where)
+    bodies = merging.merged()
     category = category_of(beside) if beside.exists(META_FILE) else UNKNOWN_CATEGORY
-    return Description(category, bodies, (*found.notes(), *joint_notes(urdf, bodies)))
+    return Description(category, bodies, (*found.notes(), *merging.notes(), *joint_notes(urdf, bodies)))
 
 
 def _gapartnet_names(files: ObjectFiles) -> dict[str, str]:

@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from collector.objects.articulation import MIN_RANGE
+from collector.objects.articulation import ends_at_zero
 from collector.objects.model import ObjectModel, bounding_box, transformed
 from shared.errors import ObjectError, UsageError
 from shared.io.text import short
@@ -72,7 +72,7 @@ def opening_upwards(model: ObjectModel) -> tuple[ObjectModel, list[str]]:
     """
     parts, turned = [], []
     for part in model.parts:
-        if part.lower < -MIN_RANGE and abs(part.upper) <= MIN_RANGE:
+        if ends_at_zero(part.lower, part.upper):
             turned.append(short(part.name))
             x, y, z = part.axis
             part = replace(part, axis=(-x, -y, -z), lower=0.0, upper=-part.lower)

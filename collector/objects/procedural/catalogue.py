@@ -34,7 +34,7 @@ from collector.objects.procedural.openings import (
 )
 from collector.objects.writing import write_object
 from shared.errors import UsageError
-from shared.io.files import TEMPORARY_PREFIX, remove_if_abandoned, writing
+from shared.io.files import remove_remnants, writing
 from shared.io.text import short
 from shared.seeds import generator
 from shared.tasks import Task
@@ -95,8 +95,7 @@ def generate(out: Path, counts: Mapping[str, int], seed: int) -> list[Path]:
         raise UsageError(f"seed and counts must not be negative; given seed {seed}, counts {dict(counts)}")
     with writing(out, "name a folder that can"):
         out.mkdir(parents=True, exist_ok=True)
-        for remnant in out.glob(f"{TEMPORARY_PREFIX}*"):
-            remove_if_abandoned(remnant)
+        remove_remnants(out)
         return [
             write_object(out / f"{category.lower()}-{index:04d}", build(category, seed, index))
             for category, count in counts.items()

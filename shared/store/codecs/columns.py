@@ -188,18 +188,18 @@ def _rollout_columns() -> tuple[Column[RolloutRow], ...]:
         Column("rollout", "<i8", 0, "number within the plan", lambda x: r(x).index),
         Column("object_id", "", 0, "object", lambda x: r(x).object.id),
         Column("object_category", "", 0, "its category", lambda x: r(x).object.category),
-        Column("object_hash", "", 0, "SHA-256 of its files", lambda x: r(x).object.content_hash),
+        Column("object_hash", "", 0, "SHA-256 of what was read of its files", lambda x: r(x).object.content_hash),
         *(_hidden_column(name, name) for name in ALWAYS_DRAWN),
         Column(
             "direction",
             "",
             0,
-            "hidden: ways the joint turns",
+            "hidden: ways that joints move from the rollout's start; clockwise: to greater positions",
             lambda x: r(x).dynamics.direction,
             allowed=Direction,
         ),
-        Column("azimuth_deg", "<f8", 0, "camera", lambda x: r(x).azimuth_deg),
-        Column("elevation_deg", "<f8", 0, "camera", lambda x: r(x).elevation_deg),
+        Column("azimuth_deg", "<f8", 0, "of the camera, from +x about z", lambda x: r(x).azimuth_deg),
+        Column("elevation_deg", "<f8", 0, "of the camera, above the floor", lambda x: r(x).elevation_deg),
         Column("seed", "<u8", 0, "the plan's seed", lambda x: r(x).seed),
         Column("fidelity", "", 0, "name of the preset", lambda x: r(x).fidelity),
         Column(
@@ -275,10 +275,12 @@ def _choice_columns() -> tuple[Column[InteractionRow], ...]:
             lambda x: json.dumps(list(i(x).joint_names)),
             longest=MAX_JOINT_NAMES,
         ),
-        Column("joint_positions", "<f8", LIST, "all joints at the start", lambda x: i(x).joint_positions),
-        Column("joint_limits", "<f8", LIST, "lower, upper of each joint", lambda x: i(x).joint_limits.ravel()),
+        Column("joint_positions", "<f8", LIST, "of all joints at the start, rad or m", lambda x: i(x).joint_positions),
+        Column(
+            "joint_limits", "<f8", LIST, "lower, upper of each joint, as simulated", lambda x: i(x).joint_limits.ravel()
+        ),
         Column("joint_twist", "<f8", 6, "hidden: (w, v) of the target joint, world", lambda x: i(x).joint_twist),
-        Column("hand_start", "<f8", 7, "hand at the start, world, xyz wxyz", lambda x: i(x).hand_start),
+        Column("hand_start", "<f8", 7, "hand frame at the start, world, xyz wxyz", lambda x: i(x).hand_start),
     )
 
 
@@ -286,12 +288,33 @@ def _outcome_columns() -> tuple[Column[InteractionRow], ...]:
     i, o = operator.attrgetter("interaction"), operator.attrgetter("interaction.outcome")
     return (
         Column("outcome", "", 0, "how the trial ended", lambda x: o(x).kind, allowed=OutcomeKind),
-        Column("motion", "<f8", 0, "m, rad or length", lambda x: o(x).motion),
+        Column("motion", "<f8", 0, "m, rad or m; 0 unless the outcome is ok", lambda x: o(x).motion),
         Column("success", "|b1", 0, "r", lambda x: o(x).success),
-        Column("start_joint_position", "<f8", 0, "of the target", lambda x: o(x).start_joint_position, finite=False),
-        Column("end_joint_position", "<f8", 0, "of the target", lambda x: o(x).end_joint_position, finite=False),
+        Column(
+            "start_joint_position",
+            "<f8",
+            0,
+            "of the target, rad or m",
+            lambda x: o(x).start_joint_position,
+            finite=False,
+        ),
+        Column(
+            "end_joint_position",
+            "<f8",
+            0,
+            "likewise, when the trial ended",
+            lambda x: o(x).end_joint_position,
+            finite=False,
+        ),
         Column("displacement", "<f8", 3, "of the touched point, world", lambda x: o(x).displacement, finite=False),
-        Column("grasp_opening", "<f8", 0, "both fingers after closing", lambda x: o(x).grasp_opening, finite=False),
+        Column(
+            "grasp_opening",
+            "<f8",
+            0,
+            "both fingers together once closed, m",
+            lambda x: o(x).grasp_opening,
+            finite=False,
+        ),
         Column("steps", "<i8", 0, "physics steps", lambda x: o(x).steps),
         Column("seconds", "<f8", 0, "wall time", lambda x: i(x).seconds, content=False),
     )

@@ -20,6 +20,7 @@ from shared.io.files import (
     DRIVER_LOCK,
     exclusive_lock,
     read_bounded,
+    remove_remnants,
     remove_tree,
     sync_file,
     sync_folder,
@@ -116,6 +117,8 @@ class DiskDestination:
             )
         notes.mkdir(exist_ok=True)
         with exclusive_lock(notes / DRIVER_LOCK):
+            for written in (folder, notes):
+                remove_remnants(written)
             if self.note(BEGUN) != identity:
                 # Begun by another command, or before the store had grown.
                 for path in [*folder.iterdir(), *notes.iterdir()]:
