@@ -229,7 +229,7 @@ def _merged(points: Float32, votes: Float32, numbers: NDArray[np.int64]) -> NDAr
 
 def _spread(points: Float, known: Float, labels: NDArray[np.int64]) -> NDArray[np.int64]:
     """Labels of points, [any, 3], from those of some of them, [N, 3]."""
-    near = np.asarray(cKDTree(known).query(points, k=NEAREST)[1])
+    near = np.asarray(cKDTree(known).query(points, k=NEAREST, workers=-1)[1])
     told = labels[near]
     # The nearest counts unless the two others agree against it.
     outvoted = (told[:, 1] == told[:, 2]) & (told[:, 0] != told[:, 1])
