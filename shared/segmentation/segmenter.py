@@ -62,14 +62,23 @@ class Part:
     """A movable part that was found.
 
     Attributes:
-        kind: how it moves.
         points: [any], the points of the scan that are of it.
-        confidence: mean probability of its kind over its points, less for a part of few points; in [0, 1].
+        confidences: of each way to move, its mean probability over the points, less for a part of few points; in
+            [0, 1].
     """
 
-    kind: Kind
     points: NDArray[np.int64]
-    confidence: float
+    confidences: Mapping[Kind, float]
+
+    @property
+    def kind(self) -> Kind:
+        """How it moves."""
+        return max(self.confidences, key=self.confidences.__getitem__)
+
+    @property
+    def confidence(self) -> float:
+        """That it moves in this way."""
+        return self.confidences[self.kind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,9 +123,8 @@ class Segmenter:
             mine = labels == label
             rows = given.left[spread == label]
             if mine.any() and len(rows):
-                kind = max(MOVABLE, key=lambda kind: float(probabilities[mine, kind].sum()))
                 share = mine.sum() / (mine.sum() + FEW_POINTS)
-                parts.append(Part(kind, rows, float(share * probabilities[mine, kind].mean())))
+                parts.append(Part(rows, {k: float(share * probabilities[mine, k].mean()) for k in MOVABLE}))
         parts.sort(key=lambda part: -part.confidence)
         return Segmentation(given.left[spread >= 0], tuple(parts))
 
