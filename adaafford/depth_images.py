@@ -23,6 +23,8 @@ CAMERA_UP: Vector = (0.0, -1.0, 0.0)
 """Against gravity in the frame of a level camera: x right, y down, z forward."""
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _MAX_CHUNKS = 1 << 16
+_MOST_NIBBLES = 10
+"""Of a number of 32 bits in RVL."""
 
 
 class Lens(StrictModel):
@@ -105,7 +107,7 @@ def parse_depth(data: bytes, path: Path, lens: Lens, *, raw: bool) -> Scan:
     return checked_scan(lens.points(depths), camera=lens.camera, source=str(path), raw=raw, up=lens.up)
 
 
-def _png(data: bytes) -> NDArray[np.generic]:
+def read_png(data: bytes) -> NDArray[np.generic]:
     """The grey values of a PNG of 16 bits, [H, W].
 
     Raises:
@@ -144,6 +146,46 @@ def _png(data: bytes) -> NDArray[np.generic]:
         raise ValueError("holds fewer pixels than its header says")
     lines = np.frombuffer(rows, np.uint8).reshape(height, 1 + 2 * width)
     return _unfiltered(lines[:, 0], lines[:, 1:]).view(">u2")
+
+
+def read_rvl(data: bytes) -> NDArray[np.uint16]:
+    """Depths that were compressed by RVL (Wilson 2017), behind their width and height, [H, W].
+
+    Of each four bits, three are of a number, the lowest first, and the fourth says that more follow. Counts of zeros
+    and of other depths alternate; the other depths follow, each as the difference to the one before.
+
+    Raises:
+        ValueError: it is damaged, or too large.
+    """
+    if len(data) < 8:
+        raise ValueError("is cut off")
+    width, height = struct.unpack_from("<ii", data)
+    if min(width, height) < 1 or width * height > MAX_ROWS:
+        raise ValueError(f"has {width} x {height} pixels; allowed are {MAX_ROWS}")
+    words = np.frombuffer(data, "<u4", (len(data) - 8) // 4, 8)
+    nibbles = ((words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32)) & 15).ravel().astype(np.int64)
+    ends = np.flatnonzero(nibbles < 8)
+    starts = np.concatenate([[0], ends + 1])[: len(ends)]
+    lengths = ends - starts + 1
+    if len(ends) == 0 or lengths.max() > _MOST_NIBBLES:
+        raise ValueError("is damaged")
+    places = np.arange(lengths.sum()) - np.repeat(starts, lengths)
+    numbers = np.add.reduceat((nibbles[: len(places)] & 7) << (3 * places), starts)
+    measured, is_depth = np.zeros(width * height, bool), np.zeros(len(numbers), bool)
+    pixel = place = 0
+    while pixel < len(measured):
+        if place + 2 > len(numbers):
+            raise ValueError("is cut off")
+        zeros, others = numbers[place : place + 2].tolist()
+        pixel, place = pixel + zeros, place + 2
+        if pixel + others > len(measured) or place + others > len(numbers) or not zeros + others:
+            raise ValueError("is damaged or cut off")
+        measured[pixel : pixel + others], is_depth[place : place + others] = True, True
+        pixel, place = pixel + others, place + others
+    told = numbers[is_depth]
+    depths = np.zeros(width * height, np.uint16)
+    depths[measured] = np.cumsum((told >> 1) ^ -(told & 1)).astype(np.uint16)
+    return depths.reshape(height, width)
 
 
 def _unfiltered(filters: NDArray[np.uint8], lines: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -187,5 +229,5 @@ def _npy(data: bytes) -> NDArray[np.generic]:
     return read_npy(io.BytesIO(data), "depth", len(data))
 
 
-_READERS = {".png": _png, ".npy": _npy, ".npz": _npz}
+_READERS = {".png": read_png, ".npy": _npy, ".npz": _npz}
 assert tuple(_READERS) == DEPTH_SUFFIXES

@@ -25,6 +25,8 @@ SEGMENTATION = "segmentation"
 """Name of the bundled network."""
 AUTO = "auto"
 MAX_NUMBER = MAX_PARTS = 64
+LEAST_CONFIDENCE = 0.1
+"""That a part turns which rather slides; a task for turning parts considers it from here on."""
 CLICK_M = 0.05
 """How far from a click a part may be."""
 FOLLOW_M = 0.4
@@ -91,7 +93,7 @@ class FoundPart(StrictModel):
     kind: Literal["turning", "sliding"]
     confidence: float = Field(ge=0, le=1)
     """The network's mean probability over the part's points that they are of a part of this kind, less for a part of
-    few points."""
+    few points. The kind is one that the task acts on."""
     centre: Vector
     """The median of the points that are seen of it, frame of the scan."""
     points: int
@@ -146,7 +148,7 @@ class PartFinder:
     """Finds the parts of raw scans that a task acts on.
 
     Args:
-        task: by name; of one that acts on turning parts alone, only these are found.
+        task: by name; for one that acts on turning parts alone, the confidence of a part is that it turns.
         segmenter: the network; the bundled one unless given.
     """
 
@@ -214,7 +216,7 @@ class PartFinder:
                 found = self._segmenter.segment(frame.to_world(scan.points), frame.to_world([camera])[0])
             except UsageError as error:
                 raise PartError(f"{source}: {error}") from None
-            self._last = scan, found, tuple(part for part in found.parts if part.kind in self._kinds)[:MAX_PARTS]
+            self._last = scan, found, self._suitable(found.parts)[:MAX_PARTS]
         _, found, parts = self._last
         if not parts:
             kinds = " or ".join(kind.name.lower() for kind in self._kinds)
@@ -223,6 +225,15 @@ class PartFinder:
                 "on as 'movable' and leave out --part"
             )
         return found, parts
+
+    def _suitable(self, parts: tuple[Part, ...]) -> tuple[Part, ...]:
+        """The parts that may move as the task wants it, in the order of the confidence that they do."""
+        suitable = []
+        for part in parts:
+            wanted = replace(part, confidences={k: c for k, c in part.confidences.items() if k in self._kinds})
+            if part.kind in self._kinds or wanted.confidence >= LEAST_CONFIDENCE:
+                suitable.append(wanted)
+        return tuple(sorted(suitable, key=lambda part: -part.confidence))
 
 
 @cache

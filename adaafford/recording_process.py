@@ -8,22 +8,22 @@ definitions of their types, not by those that a recording brings.
 
 import io
 import math
-import re
 import resource
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from adaafford.columns import MAX_SCAN_BYTES, Columns, shown
-from adaafford.recordings import MAX_CPU_S, METADATA, Selection
+from adaafford.recording_files import RecordingFiles
+from adaafford.recordings import MAX_CPU_S, Selection
 from adaafford.ros_messages import (
     CAMERA_INFO,
     CLOUD,
+    COMPRESSED,
     IMAGE,
     MAX_APART_S,
     TRANSFORMS,
@@ -33,22 +33,19 @@ from adaafford.ros_messages import (
     is_depth,
     seconds,
     sensor_pose,
+    unpacked_depth,
 )
 from shared.errors import UsageError
-from shared.io.files import read_bounded
 from shared.io.text import plain
-
-if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
 
 MAX_MEMORY = 2 << 30
 """Bytes of address space beyond what the libraries take."""
-MAX_METADATA_BYTES = 1 << 20
 MAX_TOPICS, MAX_IMAGES = 1000, 32
 """Topics, and topics of images whose encoding is looked at."""
+_IMAGES = (IMAGE, COMPRESSED)
+_EVER = (1 << 63) - 1
 SECOND = 10**9
 """Recordings count nanoseconds."""
-_WHOLE_FILES = re.compile(rb"compression_mode:\s*['\"]?file", re.IGNORECASE)
 _GROWTH = 8
 """Of the time that is looked through, backwards from its end, until a message is found."""
 
@@ -57,25 +54,23 @@ class _Recording:
     """An open recording.
 
     Args:
-        reader: that has opened it.
+        files: of it, open.
         selection: what is wanted of it.
     """
 
-    def __init__(self, reader: Reader, selection: Selection) -> None:
-        self._reader, self._wanted = reader, selection
+    def __init__(self, files: RecordingFiles, selection: Selection) -> None:
+        self._files, self._wanted = files, selection
         self._types = get_typestore(Stores.ROS2_HUMBLE)
-        self._until = reader.end_time
+        self._until = files.end
         if selection.at is not None:
-            self._until = min(self._until, reader.start_time + math.floor(selection.at * SECOND) + 1)
-        self._topics: dict[str, list[Connection]] = {}
-        for each in reader.connections[:MAX_TOPICS]:
-            self._topics.setdefault(each.topic, []).append(each)
+            self._until = min(self._until, files.start + math.floor(selection.at * SECOND) + 1)
+        self._kinds = files.kinds(MAX_TOPICS)
 
     def scan(self) -> tuple[Columns, str]:
         """The wanted scan, and a line that says which it is."""
         topic = self._wanted.topic or self._only_topic()
-        kind = self._topics[topic][0].msgtype if topic in self._topics else None
-        if kind not in (CLOUD, IMAGE):
+        kind = self._kinds.get(topic)
+        if kind is None or kind not in (CLOUD, *_IMAGES):
             raise UsageError(f"has no cloud or image of the topic {shown([topic])}; {self._listed()}")
         time, message = self._last(topic, kind, self._until)
         pose, frame = None, self._wanted.frame
@@ -86,24 +81,29 @@ class _Recording:
         if kind == CLOUD:
             found = cloud_scan(message, frame, pose)
         else:
-            found = depth_scan(message, self._camera_info(topic), "rect" in topic.rpartition("/")[2], frame, pose)
-        after = (time - self._reader.start_time) / SECOND
+            # A transport adds its own name to that of the image.
+            image = topic.removesuffix("/compressedDepth").removesuffix("/compressed")
+            depths = unpacked_depth(message) if kind == COMPRESSED else message
+            found = depth_scan(depths, self._camera_info(image), "rect" in image.rpartition("/")[2], frame, pose)
+        after = (time - self._files.start) / SECOND
         given = shown([frame or message.header.frame_id])
-        return found, f"its {shown([topic])} {after:.3f} s after the beginning, in the frame {given}"
+        names = shown(self._files.cut)
+        cut = f" ({names}, not closed by its recorder, is read as far as it is whole)" * bool(self._files.cut)
+        return found, f"its {shown([topic])} {after:.3f} s after the beginning, in the frame {given}{cut}"
 
     def _only_topic(self) -> str:
         """The one topic of a cloud, or of depth where there are no clouds."""
-        found = self._of_kind(CLOUD) or [topic for topic in self._of_kind(IMAGE)[:MAX_IMAGES] if self._is_depth(topic)]
+        found = self._of_kind(CLOUD) or [t for t in self._of_kind(*_IMAGES)[:MAX_IMAGES] if self._is_depth(t)]
         if len(found) == 1:
             return found[0]
         raise UsageError(f"holds scans of {len(found)} topics; {self._listed()}{'; name one by --topic' * bool(found)}")
 
-    def _of_kind(self, kind: str) -> list[str]:
-        return sorted(topic for topic, held in self._topics.items() if held[0].msgtype == kind and _counted(held))
+    def _of_kind(self, *kinds: str) -> list[str]:
+        return sorted(topic for topic, kind in self._kinds.items() if kind in kinds)
 
     def _is_depth(self, topic: str) -> bool:
         try:
-            return is_depth(self._last(topic, IMAGE, self._until)[1])
+            return is_depth(self._last(topic, self._kinds[topic], self._until)[1])
         except UsageError:
             return False
 
@@ -112,20 +112,20 @@ class _Recording:
         beside, known = f"{topic.rpartition('/')[0]}/camera_info", self._of_kind(CAMERA_INFO)
         if beside not in known and len(known) != 1:
             raise UsageError(f"needs the topic {shown([beside])} with the intrinsics; of this kind are {shown(known)}")
-        return self._last(beside if beside in known else known[0], CAMERA_INFO, self._reader.end_time)[1]
+        return self._last(beside if beside in known else known[0], CAMERA_INFO, self._files.end)[1]
 
-    def _transforms(self, topic: str, start: int | None = None, stop: int | None = None) -> Iterator[TransformStamped]:
+    def _transforms(self, topic: str, start: int = 0, stop: int = _EVER) -> Iterator[TransformStamped]:
         if topic in self._of_kind(TRANSFORMS):
-            for _, _, data in self._reader.messages(self._topics[topic], start, stop):
+            for _, data in self._files.messages(topic, start, stop):
                 yield from self._read(data, TRANSFORMS).transforms
 
     def _last(self, topic: str, kind: str, until: int) -> tuple[int, Any]:
         """The last message of a topic before a time, and its time; recordings are long, so it is looked for there."""
-        found, span, begin = None, SECOND, self._reader.start_time
+        found, span, begin = None, SECOND, self._files.start
         while found is None:
             start = max(begin, until - span)
-            for _, time, data in self._reader.messages(self._topics[topic], start, until):
-                found = time, data
+            for found in self._files.messages(topic, start, until):  # noqa: B007 - the last one is wanted.
+                pass
             if start <= begin:
                 break
             span *= _GROWTH
@@ -139,7 +139,7 @@ class _Recording:
         return self._types.deserialize_cdr(data, kind)
 
     def _listed(self) -> str:
-        return f"clouds: {shown(self._of_kind(CLOUD))}; images: {shown(self._of_kind(IMAGE))}"
+        return f"clouds: {shown(self._of_kind(CLOUD))}; images: {shown(self._of_kind(*_IMAGES))}"
 
 
 def scan_of(path: Path, selection: Selection) -> tuple[bytes, str]:
@@ -149,23 +149,13 @@ def scan_of(path: Path, selection: Selection) -> tuple[bytes, str]:
         UsageError: there is no such scan, with the reason.
         Exception: of the library, where a recording is damaged.
     """
-    if path.is_dir():
-        if _WHOLE_FILES.search(read_bounded(path / METADATA, MAX_METADATA_BYTES)):
-            raise UsageError("its files are compressed as a whole; unpack one by `zstd -d`, and name that file")
-    elif set("?#%") & set(str(path)) and path.suffix == ".db3":
-        raise UsageError("the path of an SQLite file must not have ?, # or %; move or rename it")
-    with Reader(path) as reader:
-        columns, line = _Recording(reader, selection).scan()
+    with RecordingFiles(path) as files:
+        columns, line = _Recording(files, selection).scan()
     held = io.BytesIO()
     with np.errstate(invalid="ignore", over="ignore"):
         narrow = {name: np.asarray(values, np.float32) for name, values in columns.items()}
     np.savez(held, allow_pickle=False, **narrow)
     return held.getvalue(), line
-
-
-def _counted(connections: "list[Connection]") -> bool:
-    """Whether there are messages."""
-    return any(each.msgcount for each in connections)
 
 
 def _limit() -> None:

@@ -1,4 +1,4 @@
-"""Recordings of ROS 2 (MCAP, SQLite, or a rosbag2 folder of these): one scan is taken out of them, as an NPZ.
+"""Recordings of ROS 2 (MCAP, SQLite, or a folder of these): one scan is taken out of them, as an NPZ.
 
 Needs `pip install 'adaafford[ros]'`. Recordings are untrusted, so another process with bounds opens them
 (`adaafford.recording_process`).
@@ -17,9 +17,10 @@ from shared.extras import require
 from shared.io.interpreter import PYTHON, own_environment
 from shared.io.text import plain
 
-SUFFIXES = (".mcap", ".db3")
+SUFFIXES, PACKED = (".mcap", ".db3"), ".zstd"
+"""Of the files of a recording, and what follows where a file is compressed as a whole."""
 METADATA = "metadata.yaml"
-"""The file that makes a folder a recording."""
+"""What makes a folder a recording; one that was not closed has files alone."""
 MAX_CPU_S, MAX_WAIT_S = 120, 600
 """For one scan. A reader that takes longer has met a file that is made to be slow, or one without an index."""
 MAX_AT = 1e9
@@ -46,8 +47,18 @@ WHOLE = Selection()
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is that of a recording, by its name."""
-    return path.suffix in SUFFIXES or os.path.isfile(path / METADATA)  # noqa: PTH113 - of a name too long pathlib raises.
+    """Whether a path is that of a recording, by its name, or of a folder by the names in it."""
+    if is_storage(path.name):
+        return True
+    try:
+        return any(name == METADATA or is_storage(name) for name in os.listdir(path))  # noqa: PTH208 - of a name too long pathlib raises.
+    except (OSError, ValueError):  # The latter of a name with a zero byte.
+        return False
+
+
+def is_storage(name: str) -> bool:
+    """Whether a file is of a recording, by its name."""
+    return name.removesuffix(PACKED).endswith(SUFFIXES)
 
 
 def take_scan(path: Path, selection: Selection) -> tuple[bytes, str]:

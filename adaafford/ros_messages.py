@@ -4,8 +4,10 @@ A message is any object with the fields of its definition, whether rclpy or a re
 untrusted. Every function raises `ValueError` with a reason that a user understands.
 """
 
+import struct
 from array import array
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from adaafford.columns import Columns, cloud_of, shown
-from adaafford.depth_images import CAMERA_UP, Lens
+from adaafford.depth_images import CAMERA_UP, Lens, read_png, read_rvl
 from adaafford.scans import MAX_ROWS
 from shared.config import parse
 from shared.geometry import gripper_rotation
@@ -21,10 +23,14 @@ from shared.types import Float
 
 MAX_APART_S = 0.5
 """Between a scan and a transformation that is not static."""
-CLOUD, IMAGE, CAMERA_INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+CLOUD, CAMERA_INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _DEPTH_TYPES = {"16UC1": "u2", "32FC1": "f4"}
 """By the encoding of depth images (REP 118): millimetres, and metres."""
+_DEPTH_TRANSPORT = "compressedDepth"
+_DEPTH_HEADER = struct.Struct("<iff")
+"""What it puts before the image: its kind, and two numbers of which metres are made."""
 _SILENT = np.errstate(invalid="ignore", over="ignore")
 """NumPy warns where it meets certain bits of NaN, and where a number becomes infinite."""
 _POINT_TYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -80,6 +86,37 @@ class Image(Protocol):
     is_bigendian: int
     step: int
     data: Data
+
+
+class CompressedImage(Protocol):
+    """sensor_msgs/CompressedImage."""
+
+    header: Header
+    format: str
+    data: Data
+
+
+@dataclass(frozen=True, slots=True)
+class DepthImage:
+    """A depth image as `Image` is, unpacked.
+
+    Attributes:
+        header: of the packed one.
+        depths: [H, W], whole numbers in millimetres, or floating-point numbers in metres.
+    """
+
+    header: Header
+    depths: NDArray[np.generic]
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return len(self.depths)
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int(self.depths.shape[1])
 
 
 class CameraInfo(Protocol):
@@ -155,7 +192,7 @@ def cloud_scan(message: PointCloud2, frame: str | None = None, pose: Float | Non
 
 @_SILENT
 def depth_scan(
-    message: Image, info: CameraInfo, rectified: bool, frame: str | None = None, pose: Float | None = None
+    message: Image | DepthImage, info: CameraInfo, rectified: bool, frame: str | None = None, pose: Float | None = None
 ) -> Columns:
     """The places that a depth image shows, row by row, and what is known of its camera.
 
@@ -166,22 +203,63 @@ def depth_scan(
         frame: as in `cloud_scan`.
         pose: likewise.
     """
-    if not is_depth(message):
+    if isinstance(message, DepthImage):
+        depths = message.depths
+    elif message.encoding in _DEPTH_TYPES:
+        dtype = np.dtype((">" if message.is_bigendian else "<") + _DEPTH_TYPES[message.encoding])
+        buffer = np.frombuffer(message.data, np.uint8)
+        _check_layout(message.height, message.width, dtype.itemsize, message.step, len(buffer))
+        depths = _cells(buffer, message.height, message.width, dtype, 0, (message.step, dtype.itemsize))
+    else:
         raise ValueError(f"its encoding is '{shown([message.encoding])}'; depths are {' or '.join(_DEPTH_TYPES)}")
-    dtype = np.dtype((">" if message.is_bigendian else "<") + _DEPTH_TYPES[message.encoding])
-    buffer = np.frombuffer(message.data, np.uint8)
-    _check_layout(message.height, message.width, dtype.itemsize, message.step, len(buffer))
-    depths = _cells(buffer, message.height, message.width, dtype, 0, (message.step, dtype.itemsize))
     # The frame of an image is optical by definition, whatever its name.
     return _placed({"points": lens_of(info, message, rectified).points(depths)}, frame or "_optical", pose)
 
 
-def is_depth(message: Image) -> bool:
+def is_depth(message: Image | CompressedImage) -> bool:
     """Whether an image holds depths."""
-    return message.encoding in _DEPTH_TYPES
+    form: str | None = getattr(message, "format", None)
+    if form is None:
+        return message.encoding in _DEPTH_TYPES  # type: ignore[union-attr]
+    return (
+        _DEPTH_TRANSPORT in form or form.partition(";")[0].strip() in _DEPTH_TYPES or _is_grey_png(message.data, form)
+    )
 
 
-def lens_of(info: CameraInfo, image: Image, rectified: bool) -> Lens:
+def unpacked_depth(message: CompressedImage) -> DepthImage:
+    """A depth image that was sent as a PNG or by RVL.
+
+    The transport `compressedDepth` puts 12 bytes before it, and sends metres as 16-bit numbers a / depth + b, of which
+    these bytes have a and b. `compressed` sends the PNG alone.
+    """
+    encoding, _, packing = message.format.partition(";")
+    data, encoding = bytes(message.data), encoding.strip()
+    if not is_depth(message):
+        raise ValueError(
+            f"its format is '{shown([message.format])}'; depths are PNG or RVL of {' or '.join(_DEPTH_TYPES)}"
+        )
+    inverse = None
+    if _DEPTH_TRANSPORT in message.format:
+        if len(data) < _DEPTH_HEADER.size:
+            raise ValueError(f"its {len(data)} bytes are fewer than its header")
+        _, *inverse = _DEPTH_HEADER.unpack_from(data)
+        data = data[_DEPTH_HEADER.size :]
+    depths: NDArray[np.generic] = read_rvl(data) if "rvl" in packing else read_png(data)
+    if encoding == "32FC1":
+        if inverse is None:
+            raise ValueError("its metres were sent as a plain image, which rounds them; record compressedDepth")
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            depths = np.where(depths == 0, np.nan, inverse[0] / (depths.astype(np.float64) - inverse[1]))
+    return DepthImage(message.header, depths)
+
+
+def _is_grey_png(data: Data, form: str) -> bool:
+    """Whether an image whose format names no encoding is a PNG of 16 bits of grey."""
+    head = bytes(data[:26])
+    return form.strip().lower() in ("png", "") and head.startswith(b"\x89PNG") and head[24:26] == b"\x10\0"
+
+
+def lens_of(info: CameraInfo, image: Image | DepthImage, rectified: bool) -> Lens:
     """The camera of an image; arguments as in `depth_scan`."""
     if (info.width, info.height) != (image.width, image.height):
         raise ValueError(

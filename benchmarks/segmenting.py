@@ -1,8 +1,9 @@
 """How well is the movable part of a raw scan found? Objects stand on a floor, among other things, and the camera errs.
 
 For each scene, `auto` is the intersection over union (IoU) of the most confident part with the physical part that it
-is on; 0 where none is found. `each part` is the IoU of each physical part that is seen with the found part that fits it
-best. All points of the scan count.
+is on; 0 where none is found. `turning` is the same of the part that most probably turns, with the physical parts that
+turn, in scenes that show any. `each part` is the IoU of each physical part that is seen with the found part that fits
+it best. All points of the scan count.
 """
 
 import time
@@ -33,7 +34,7 @@ from shared import seeds
 from shared.errors import UsageError
 from shared.io.files import make_folder
 from shared.progress import Progress
-from shared.segmentation.scenes import MOVABLE
+from shared.segmentation.scenes import MOVABLE, Kind
 from shared.segmentation.segmenter import Segmentation, Segmenter
 from shared.tasks import expanded
 
@@ -68,6 +69,7 @@ class Found:
         object: its id.
         category: its category.
         auto: IoU of the most confident part.
+        turning: IoU of the part that most probably turns; None where no part that turns is seen.
         each: IoU of each physical part.
         seconds: of the segmentation.
     """
@@ -75,6 +77,7 @@ class Found:
     object: str
     category: str
     auto: float
+    turning: float | None
     each: tuple[float, ...]
     seconds: float
 
@@ -137,9 +140,13 @@ def _measured(segmenter: Segmenter, target: ArticulatedObject, seen: RawScan, pi
     true = _true_parts(seen)
     each = tuple(max((_iou(one, guess) for guess in guessed), default=0.0) for one in true)
     auto = max((_iou(one, guessed[0]) for one in true), default=0.0) if guessed else 0.0
+    turning = None
+    if turns := [one for one in true if seen.kinds[one][0] == Kind.TURNING]:
+        first = max(range(len(guessed)), key=lambda n: found.parts[n].confidences[Kind.TURNING], default=None)
+        turning = 0.0 if first is None else max(_iou(one, guessed[first]) for one in turns)
     if picture is not None:
         _draw(picture, seen, found, f"{target.ref.id} {target.ref.category}: auto {auto:.2f}")
-    return Found(target.ref.id, target.ref.category, auto, each, seconds)
+    return Found(target.ref.id, target.ref.category, auto, turning, each, seconds)
 
 
 def _iou(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
@@ -151,19 +158,22 @@ def _table(found: list[Found]) -> dict[str, Any]:
     for one in found:
         by_category[one.category].append(one)
     print(f"{len(found)} scenes, IoU of movable parts")
-    print(f"  {'category':<18}{'scenes':>7}{'auto':>7}{'each part':>11}{'auto > 0.5':>12}")
+    print(f"  {'category':<18}{'scenes':>7}{'auto':>7}{'turning':>9}{'each part':>11}{'auto > 0.5':>12}")
     rows = {}
     for category, ones in [*sorted(by_category.items()), ("all", found)]:
         each = [iou for one in ones for iou in one.each]
+        turning = [one.turning for one in ones if one.turning is not None]
         row = {
             "scenes": len(ones),
             "auto": round(mean(one.auto for one in ones), 3),
+            "turning": round(mean(turning), 3) if turning else None,
             "each_part": round(mean(each), 3),
             "auto_above_half": round(mean(one.auto > 0.5 for one in ones), 3),
         }
         rows[category] = row
         print(
-            f"  {category:<18}{row['scenes']:>7}{row['auto']:>7.2f}{row['each_part']:>11.2f}"
+            f"  {category:<18}{row['scenes']:>7}{row['auto']:>7.2f}"
+            f"{'-' if not turning else format(row['turning'], '.2f'):>9}{row['each_part']:>11.2f}"
             f"{row['auto_above_half']:>12.2f}"
         )
     milliseconds = round(1000 * median(one.seconds for one in found), 1)

@@ -30,6 +30,7 @@ LEAST_SHARE = 0.04
 LEAST_WIDTH = 0.5
 """A wall is at least as wide as this share of the scan, floor included; fronts of objects are narrower."""
 MOST_WALLS = 2
+_PLANES_AT_ONCE = 32
 CONSIDERED = 20
 """The hypotheses with the most points, of which the first that is wide enough is the wall."""
 
@@ -82,38 +83,52 @@ def _plane(
         fits = (lengths > 1e-6) & ((steep < MOST_TILT) if upright else (steep > np.sqrt(1 - MOST_TILT**2)))
     normals, corners = normals[fits], corners[fits, 0]
     normals *= np.sign((normals * (camera - corners)).sum(axis=1, keepdims=True))
-    heights = sample @ normals.T - (normals * corners).sum(axis=1)
-    on, behind = (np.abs(heights) <= TOLERANCE_M).mean(axis=0), (heights < -2 * TOLERANCE_M).mean(axis=0)
+    offsets = (normals * corners).sum(axis=1)
+    on, behind = _shares(sample, normals, offsets)
     on = np.where((behind <= BEHIND) & (on >= LEAST_SHARE), on, 0.0)
     best = None
     for number in np.argsort(-on)[: CONSIDERED if upright else 1]:
-        if on[number] > 0 and (not upright or _is_wide(normals[number], heights[:, number], sample, scan, rng)):
+        if on[number] > 0 and (not upright or _is_wide(normals[number], offsets[number], sample, scan, rng)):
             best = int(number)
             break
     if best is None:
         return None
     normal, corner = normals[best], corners[best]
     for _ in range(2):
-        near = points[np.abs((points - corner) @ normal) <= TOLERANCE_M]
+        near = points[np.abs(points @ normal - corner @ normal) <= TOLERANCE_M]
         corner = near.mean(axis=0)
-        fitted: Float = np.linalg.eigh(np.cov((near - corner).T))[1][:, 0]
+        around = near - corner
+        fitted: Float = np.linalg.eigh(around.T @ around)[1][:, 0]
         normal = fitted * np.sign(fitted @ normal)
     return normal, float(normal @ corner)
 
 
-def _is_wide(normal: Float, heights: Float, sample: Float, scan: Float, rng: np.random.Generator) -> bool:
+def _shares(sample: Float, normals: Float, offsets: Float) -> tuple[Float, Float]:
+    """The shares of a sample, [S, 3], that are on each of some planes, and behind it, [P]."""
+    on, behind = np.zeros(len(normals)), np.zeros(len(normals))
+    # So few planes at a time that their heights stay in the cache of the processor.
+    for start in range(0, len(normals), _PLANES_AT_ONCE):
+        some = slice(start, start + _PLANES_AT_ONCE)
+        heights = normals[some] @ sample.T - offsets[some, None]
+        behind[some] = np.count_nonzero(heights < -2 * TOLERANCE_M, axis=1)
+        on[some] = np.count_nonzero(np.abs(heights, out=heights) <= TOLERANCE_M, axis=1)
+    return on / len(sample), behind / len(sample)
+
+
+def _is_wide(normal: Float, offset: float, sample: Float, scan: Float, rng: np.random.Generator) -> bool:
     """Whether an upright plane is as wide as a wall.
 
     Args:
         normal: [3], of the plane.
-        heights: [S], of the sample's points above it.
-        sample: [S, 3].
+        offset: of it along the normal.
+        sample: [S, 3], points on the plane and elsewhere.
         scan: [M, 3].
         rng: draws the points of the scan that say how wide it is.
     """
     along = np.array([-normal[1], normal[0]])
     room = scan[rng.integers(len(scan), size=SAMPLE), :2] @ along
-    width = np.ptp(np.percentile(sample[np.abs(heights) <= TOLERANCE_M, :2] @ along, [1, 99]))
+    on = np.abs(sample @ normal - offset) <= TOLERANCE_M
+    width = np.ptp(np.percentile(sample[on, :2] @ along, [1, 99]))
     return bool(width >= LEAST_WIDTH * np.ptp(np.percentile(room, [1, 99])))
 
 
@@ -195,10 +210,10 @@ def network_input(points: Float, camera: Float, seed: int = 0) -> tuple[Segmenta
 
 def _described(cloud: Float, points: Float, camera: Float) -> tuple[Float, Float]:
     """Points on their local planes, [N, 3], and their further inputs, [N, EXTRA]."""
-    _, near = cKDTree(cloud).query(points, k=min(NEIGHBOURS, len(cloud)))
+    _, near = cKDTree(cloud, balanced_tree=False).query(points, k=min(NEIGHBOURS, len(cloud)), workers=-1)
     middles = cloud[near].mean(axis=1)
     local = cloud[near] - middles[:, None]
-    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local) / local.shape[1])
+    variances, axes = np.linalg.eigh(local.transpose(0, 2, 1) @ local / local.shape[1])
     normals = axes[:, :, 0]
     normals *= np.where(((camera - points) * normals).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
     offsets = middles - points

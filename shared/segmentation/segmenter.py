@@ -61,14 +61,23 @@ class Part:
     """A movable part that was found.
 
     Attributes:
-        kind: how it moves.
         points: [any], the points of the scan that are of it.
-        confidence: mean probability of its kind over its points, less for a part of few points; in [0, 1].
+        confidences: of each way to move, its mean probability over the points, less for a part of few points; in
+            [0, 1].
     """
 
-    kind: Kind
     points: NDArray[np.int64]
-    confidence: float
+    confidences: Mapping[Kind, float]
+
+    @property
+    def kind(self) -> Kind:
+        """How it moves."""
+        return max(self.confidences, key=self.confidences.__getitem__)
+
+    @property
+    def confidence(self) -> float:
+        """That it moves in this way."""
+        return self.confidences[self.kind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,9 +122,8 @@ class Segmenter:
             mine = labels == label
             rows = given.left[spread == label]
             if mine.any() and len(rows):
-                kind = max(MOVABLE, key=lambda kind: float(probabilities[mine, kind].sum()))
                 share = mine.sum() / (mine.sum() + FEW_POINTS)
-                parts.append(Part(kind, rows, float(share * probabilities[mine, kind].mean())))
+                parts.append(Part(rows, {k: float(share * probabilities[mine, k].mean()) for k in MOVABLE}))
         parts.sort(key=lambda part: -part.confidence)
         return Segmentation(given.left[spread >= 0], tuple(parts))
 
@@ -228,7 +236,7 @@ def _merged(points: Float32, votes: Float32, numbers: NDArray[np.int64]) -> NDAr
 
 def _spread(points: Float, known: Float, labels: NDArray[np.int64]) -> NDArray[np.int64]:
     """Labels of points, [any, 3], from those of some of them, [N, 3]."""
-    near = np.asarray(cKDTree(known).query(points, k=NEAREST)[1])
+    near = np.asarray(cKDTree(known).query(points, k=NEAREST, workers=-1)[1])
     told = labels[near]
     # The nearest counts unless the two others agree against it.
     outvoted = (told[:, 1] == told[:, 2]) & (told[:, 0] != told[:, 1])

@@ -43,8 +43,8 @@ class GivenSegmenter(Segmenter):
         for side, confidence in ((1.0, 0.9), (-1.0, 0.7)):
             mine = np.flatnonzero(thing & (points[:, 0] < 1.0) & (side * points[:, 1] > 0))
             if len(mine):
-                found.append(Part(Kind.TURNING, mine, confidence))
-        found.append(Part(Kind.SLIDING, np.flatnonzero(thing)[:100], 0.5))
+                found.append(Part(mine, {Kind.TURNING: confidence, Kind.SLIDING: 0.0}))
+        found.append(Part(np.flatnonzero(thing)[:100], {Kind.TURNING: 0.09, Kind.SLIDING: 0.5}))
         return Segmentation(np.flatnonzero(thing), tuple(found))
 
 
@@ -154,6 +154,28 @@ def test_a_task_that_acts_on_all_parts_finds_what_slides() -> None:
     cut = PartFinder("push").cut_out(scan, UP, CAMERA, "3", None, "scan")
     assert cut.answer.chosen.kind == "sliding"
     assert cut.scan.movable is not None and cut.scan.movable.sum() == 100
+
+
+def test_for_a_task_about_doors_the_confidence_is_that_a_part_turns() -> None:
+    thirds = np.split(np.arange(300), 3)
+    told = (
+        {Kind.TURNING: 0.3, Kind.SLIDING: 0.8},
+        {Kind.TURNING: 0.2, Kind.SLIDING: 0.1},
+        {Kind.TURNING: 0.05, Kind.SLIDING: 0.9},
+    )
+
+    class Told(Segmenter):
+        def __init__(self) -> None:
+            pass
+
+        def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+            return Segmentation(np.arange(300), tuple(map(Part, thirds, told)))
+
+    places = np.random.default_rng(0).uniform(0.5, 1, (300, 3))
+    for task, expected in (("push", [0.9, 0.8, 0.2]), ("pull-closed-door", [0.3, 0.2])):
+        answer = PartFinder(task, Told()).cut_out(Scan(places), UP, CAMERA, "auto", None, "scan").answer
+        assert [part.confidence for part in (answer.chosen, *answer.alternatives)] == expected
+    assert {part.kind for part in (answer.chosen, *answer.alternatives)} == {"turning"}
 
 
 def test_the_command_says_which_part(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,9 @@
 """Scans out of recordings of ROS 2: storages, layouts of messages, topics, frames, and whatever is no recording."""
 
 import json
-from contextlib import suppress
+import sqlite3
+import struct
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +14,17 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores
 
 import shared.extras as extras_module
-from adaafford.depth_images import Lens, parse_depth
+from adaafford.depth_images import Lens, parse_depth, read_rvl
 from adaafford.histories import TriedOutcome, read_history
 from adaafford.recording_process import scan_of
-from adaafford.recordings import Selection
-from adaafford.ros_messages import cloud_scan
+from adaafford.recordings import Selection, is_recording
+from adaafford.ros_messages import cloud_scan, unpacked_depth
 from adaafford.scans import Scan, parse_scan, read_scan
 from adaafford.sessions import Session, SessionFiles
 from cluster.cli.main import run as adaafford
 from shared.errors import UsageError
 from shared.types import Float
-from tests.support.ros_recordings import OPTICAL, Messages
+from tests.support.ros_recordings import OPTICAL, Messages, png, rvl
 from tests.support.small_policies import policy_of
 
 ROS = Messages()
@@ -57,7 +59,7 @@ def test_the_last_cloud_is_taken_or_the_last_until_a_time(
     said = [("/points", 30.0 * k, ros.cloud(points(k), stamp=30.0 * k)) for k in range(3)]
     folder = ros.write(tmp_path / "drive", said, storage, packing)
     (file,) = [*folder.glob("*.mcap"), *folder.glob("*.db3")]
-    for path in (folder,) if packing == "message" else (folder, file):
+    for path in (folder, file):
         np.testing.assert_array_equal(taken(path).points, points(2))
         np.testing.assert_array_equal(taken(path, at=59.9).points, points(1))
         np.testing.assert_array_equal(taken(path, at=0).points, points(0))
@@ -168,6 +170,69 @@ def test_a_depth_image_says_the_same_as_its_file_with_intrinsics(
     assert scan.missing == file.missing == 5 * 64 and scan.up == file.up
 
 
+HEADER = struct.Struct("<iff")
+INVERSE = (31.25, -3.0)
+"""How the transport `compressedDepth` sends metres: a / depth + b."""
+
+
+def inverse_depths() -> Any:
+    """Depths as they are sent, and in metres as they are meant."""
+    sent = np.where(depths() == 0, 0, np.rint(INVERSE[0] / (np.maximum(depths(), 1) / 1000) + INVERSE[1])).astype("<u2")
+    with np.errstate(divide="ignore"):
+        return sent, np.where(sent == 0, 0.0, INVERSE[0] / (sent - INVERSE[1]))
+
+
+@pytest.mark.parametrize("transport", ["compressedDepth png", "compressedDepth", "compressedDepth rvl", "png", "bare"])
+@pytest.mark.parametrize("metres", [False, True])
+def test_a_compressed_depth_image_says_the_same_as_the_image(transport: str, metres: bool, tmp_path: Path) -> None:
+    sent, meant = inverse_depths() if metres else (depths(), depths() / 1000)
+    inverse = "compressedDepth" in transport
+    data = rvl(sent) if "rvl" in transport else png(sent)
+    encoding = "32FC1" if metres else "16UC1"
+    form = "png" if transport == "bare" else f"{encoding}; {'png compressed ' if transport == 'png' else transport}"
+    image = ROS.compressed(form, HEADER.pack(0, *INVERSE) * inverse + data)
+    said = [
+        ("/camera/color/image_raw/compressed", 0, ROS.compressed("rgb8; jpeg compressed bgr8", b"\xff\xd8")),
+        ("/camera/depth/image_rect_raw/compressedDepth", 0, image),
+        ("/camera/depth/camera_info", 0, ROS.camera_info(sent.shape, LENS, (0.1, 0, 0, 0, 0))),
+        ("/camera/color/camera_info", 0, ROS.camera_info((4, 4), (1, 1, 1, 1))),
+    ]
+    folder = ROS.write(tmp_path / "drive", said)
+    if transport == "png" and metres:
+        with pytest.raises(ValueError, match="rounds them; record compressedDepth"):
+            taken(folder)
+        return
+    # A bare PNG says nothing of metres, so its numbers are millimetres.
+    meant = sent / 1000 if transport == "bare" else meant
+    whole = Lens(intrinsics=(LENS[0] / 2, LENS[1] / 2, *LENS[2:])).points(meant)
+    np.testing.assert_allclose(taken(folder).points, whole[whole.any(axis=1)], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("form", "data", "expected"),
+    [
+        ("16UC1; compressedDepth png", b"short", "fewer than its header"),
+        ("16UC1; compressedDepth png", bytes(50), "is no PNG"),
+        ("16UC1; compressedDepth rvl", bytes(12) + rvl(depths())[:-400], "cut off"),
+        ("16UC1; compressedDepth rvl", bytes(12) + struct.pack("<iiI", 64, 48, 0xFFFFFFFF), "damaged"),
+        ("16UC1; compressedDepth rvl", bytes(12) + struct.pack("<iiI", 64, 48, 0), "damaged"),
+        ("16UC1; compressedDepth rvl", bytes(12) + struct.pack("<iiI", 1 << 20, 1 << 20, 0), "pixels; allowed"),
+        ("16UC1; png compressed ", png(depths(), colour=2), "16 bits of grey"),
+        ("rgb8; jpeg compressed bgr8", b"\xff\xd8", "its format is 'rgb8; jpeg"),
+    ],
+)
+def test_a_compressed_image_that_is_no_depth_image_is_refused(form: str, data: bytes, expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
+        unpacked_depth(ROS.compressed(form, data))
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=200))
+def test_no_bytes_of_rvl_raise_anything_but_a_value_error(data: bytes) -> None:
+    with suppress(ValueError):
+        assert read_rvl(struct.pack("<ii", 8, 8) + data).shape == (8, 8)
+
+
 def test_a_distorted_image_is_refused_and_a_rectified_one_has_the_projection(tmp_path: Path) -> None:
     info = ROS.camera_info((48, 64), LENS, (0.1, 0, 0, 0, 0))
     raw = ROS.write(tmp_path / "raw", [("/d/image_raw", 0, ROS.image(depths())), ("/d/camera_info", 0, info)])
@@ -265,11 +330,14 @@ def test_a_session_keeps_the_scan_of_a_recording_as_a_file(tmp_path: Path, monke
 
 def test_what_is_no_recording_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = ROS.write(tmp_path / "drive", [("/points", 0, ROS.cloud(points()))]) / "drive.mcap"
-    (tmp_path / "cut.mcap").write_bytes(whole.read_bytes()[:-100])
-    packed = ROS.write(tmp_path / "packed", [("/points", 0, ROS.cloud(points()))], "sqlite3", "file")
+    (tmp_path / "cut.mcap").write_bytes(whole.read_bytes()[:60])
+    (tmp_path / "other.mcap").write_bytes(b"no recording")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "metadata.yaml").touch()
     for path, expected in (
-        (tmp_path / "cut.mcap", "damaged, cut off, or no recording of ROS 2"),
-        (packed, "unpack one by `zstd -d`"),
+        (tmp_path / "cut.mcap", "holds no message; it was cut off"),
+        (tmp_path / "other.mcap", "damaged, cut off, or no recording of ROS 2"),
+        (tmp_path / "empty", "a folder without a file of a recording"),
         (tmp_path / "missing.db3", "no such recording"),
     ):
         flags = ["--cloud", str(path), "--history", str(tmp_path / "h.json"), "--policy", "push-faucet"]
@@ -277,6 +345,78 @@ def test_what_is_no_recording_is_refused_in_one_line(tmp_path: Path, capsys: pyt
         (line,) = capsys.readouterr().err.splitlines()
         assert str(path) in line and expected in line
     assert not (tmp_path / "h.json").exists()
+
+
+def long_drive(folder: Path, storage: str, packing: str, first: int = 0) -> Path:
+    """Three large clouds, 30 s apart, in a chunk each."""
+    said = [("/points", 30.0 * k, ROS.cloud(points(k, 100_000), stamp=30.0 * k)) for k in range(first, first + 3)]
+    (file,) = [f for f in ROS.write(folder, said, storage, packing).iterdir() if f.name != "metadata.yaml"]
+    return file
+
+
+@pytest.mark.parametrize("packing", ["", "zstd", "lz4", "none"])
+def test_of_a_recording_that_was_cut_off_what_is_whole_is_read(packing: str, tmp_path: Path) -> None:
+    data = long_drive(tmp_path / "drive", "mcap", packing).read_bytes()
+    summary = data.index(b"\x89MCAP0\r\n", 8)
+    cut = tmp_path / "cut.mcap"
+    # Without an end; in the last chunk; behind it nothing but zeros, as some file systems leave them.
+    for size, last, zeros in ((summary - 1, 2, 0), (len(data) * 4 // 5, 1, 0), (len(data) * 3 // 5, 0, 5000)):
+        cut.write_bytes(data[:size] + bytes(zeros))
+        held, line = scan_of(cut, Selection())
+        np.testing.assert_array_equal(parse_scan(held, cut, kind=".npz").points, points(last, 100_000))
+        assert "cut.mcap, not closed by its recorder" in line
+        np.testing.assert_array_equal(taken(cut, at=0).points, points(0, 100_000))
+
+
+@pytest.mark.parametrize(
+    ("storage", "packing"), [("mcap", "zstd"), ("sqlite3", ""), ("mcap", "file"), ("sqlite3", "file")]
+)
+def test_a_folder_of_several_files_is_one_recording_with_metadata_or_without(
+    storage: str, packing: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for number in range(11):
+        said = [("/points", 10.0 * number, ROS.cloud(points(number)))]
+        if number == 0:
+            said.append(("/tf_static", 0, ROS.transforms(ROS.transform("base", OPTICAL, (1, 2, 3)))))
+        for file in ROS.write(tmp_path / f"part-{number}", said, storage, packing).glob("part-*"):
+            file.rename(folder / file.name.replace("part-", "drive_"))
+    np.testing.assert_array_equal(taken(folder).points, points(10), "10 is after 9")
+    np.testing.assert_array_equal(taken(folder, at=75).points, points(7))
+    np.testing.assert_allclose(taken(folder, frame="base").points, points(10) + np.array([1, 2, 3]), atol=1e-6)
+    assert is_recording(folder)
+    if packing == "file":
+        (file,) = folder.glob("drive_3.*")
+        np.testing.assert_array_equal(taken(file).points, points(3))
+        assert is_recording(file)
+        file.write_bytes(file.read_bytes()[:30])
+        with pytest.raises(UsageError, match="holds no message; it was cut off"):
+            taken(file)
+        np.testing.assert_array_equal(taken(folder, at=35).points, points(2))
+
+
+def test_messages_in_the_log_of_an_sqlite_file_that_was_not_closed_are_read(tmp_path: Path) -> None:
+    whole = next(ROS.write(tmp_path / "whole", [("/points", 0, ROS.cloud(points(0)))], "sqlite3").glob("*.db3"))
+    last = next(ROS.write(tmp_path / "last", [("/points", 9, ROS.cloud(points(1)))], "sqlite3").glob("*.db3"))
+    with closing(sqlite3.connect(whole)) as database, closing(sqlite3.connect(last)) as other:
+        database.execute("PRAGMA journal_mode=WAL")
+        database.executemany(
+            "INSERT INTO messages VALUES (99, ?, ?, ?)", other.execute("SELECT topic_id, timestamp, data FROM messages")
+        )
+        database.commit()
+        killed = tmp_path / "killed"
+        killed.mkdir()
+        for end in ("", "-wal"):
+            (killed / f"drive_0.db3{end}").write_bytes(whole.with_name(whole.name + end).read_bytes())
+    held, line = scan_of(killed / "drive_0.db3", Selection())
+    np.testing.assert_array_equal(parse_scan(held, killed, kind=".npz").points, points(1))
+    assert "not closed by its recorder" in line
+    # What is damaged was not committed.
+    log = bytearray((killed / "drive_0.db3-wal").read_bytes())
+    log[-1] ^= 1
+    (killed / "drive_0.db3-wal").write_bytes(log)
+    np.testing.assert_array_equal(taken(killed).points, points(0))
 
 
 @settings(max_examples=60)

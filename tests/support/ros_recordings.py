@@ -1,5 +1,7 @@
 """Messages of ROS 2, and recordings of them that `rosbags` writes."""
 
+import struct
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -68,6 +70,10 @@ class Messages:
         header, data = self.header(frame, stamp), padded(pixels, gap)
         return self.make("sensor_msgs/msg/Image", header, height, width, encoding, big, step, data)
 
+    def compressed(self, form: str, data: bytes, frame: str = OPTICAL) -> Any:
+        array = np.frombuffer(data, np.uint8)
+        return self.make("sensor_msgs/msg/CompressedImage", self.header(frame, 0.0), form, array)
+
     def camera_info(
         self, shape: tuple[int, int], intrinsics: Sequence[float], distortion: Sequence[float] = (0.0,) * 5
     ) -> Any:
@@ -114,7 +120,67 @@ class Messages:
                     connections[topic] = writer.add_connection(topic, kind, typestore=self.store)
                 data = self.store.serialize_cdr(message, kind)
                 writer.write(connections[topic], round((1000 + seconds) * 1e9), data)
+        if packing == "none":
+            (file,) = folder.glob("*.mcap")
+            file.write_bytes(_without_chunks(file.read_bytes()))
         return folder
+
+
+def _without_chunks(data: bytes) -> bytes:
+    """An MCAP whose messages are in no chunks, and which has no index."""
+    kept, place, kind = data[:8], 8, 0
+    while kind != 15:
+        kind, length = struct.unpack_from("<BQ", data, place)
+        content = data[place : place + 9 + length]
+        if kind == 6:
+            kept += content[9 + 40 :]
+        elif kind in (1, 15):
+            kept += content
+        place += 9 + length
+    return kept + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + data[:8]
+
+
+def png(pixels: NDArray[Any], colour: int = 0) -> bytes:
+    """A PNG of 16 bits of grey."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    height, width = pixels.shape
+    lines = pixels.astype(">u2").view(np.uint8).reshape(height, -1)
+    head = struct.pack(">IIBBBBB", width, height, 16, colour, 0, 0, 0)
+    packed = zlib.compress(np.pad(lines, ((0, 0), (1, 0))).tobytes())
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+
+
+def rvl(pixels: NDArray[Any]) -> bytes:
+    """An image as RVL packs it, after the program in the paper (Wilson 2017)."""
+    flat, nibbles, place, previous = pixels.ravel().tolist(), list[int](), 0, 0
+
+    def write(number: int) -> None:
+        while True:
+            nibble, number = number & 7, number >> 3
+            nibbles.append(nibble | (8 if number else 0))
+            if not number:
+                return
+
+    def run(zero: bool) -> int:
+        end = place
+        while end < len(flat) and (flat[end] == 0) is zero:
+            end += 1
+        return end - place
+
+    while place < len(flat):
+        write(zeros := run(True))
+        place += zeros
+        write(others := run(False))
+        for value in flat[place : place + others]:
+            delta, previous = value - previous, value
+            write(2 * delta if delta >= 0 else -2 * delta - 1)
+        place += others
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [int("".join(f"{nibble:x}" for nibble in nibbles[k : k + 8]), 16) for k in range(0, len(nibbles), 8)]
+    return struct.pack(f"<ii{len(words)}I", pixels.shape[1], pixels.shape[0], *words)
 
 
 def padded(cells: NDArray[Any], gap: int) -> NDArray[np.uint8]:
