@@ -191,7 +191,6 @@ class Scene:
             self._set_joint_positions(positions)
             self.step()
         self._set_joint_positions(positions)
-        self.park()
 
     def _set_joint_positions(self, positions: Float) -> None:
         packed = np.zeros(len(positions), dtype=np.float32)

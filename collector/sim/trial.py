@@ -1,5 +1,7 @@
 """The execution of a primitive: its legs, the first-contact rule and the success rule (published protocol)."""
 
+import math
+
 import numpy as np
 
 from collector.sim.gripper import GRASP_OPENING, still
@@ -178,8 +180,8 @@ class Trial:
         room = self._clearance - CLEARANCE
         if room / stride < LEAST_SKIP:
             return 0
-        lag = float(np.linalg.norm(path[step, :3] - self.scene.gripper.displacement()))
-        ahead = min(int((room - lag) / stride), len(path) - 1 - step)
+        lag = path[step, :3] - self.scene.gripper.displacement()
+        ahead = min(int((room - math.sqrt(lag @ lag)) / stride), len(path) - 1 - step)
         return ahead if ahead >= LEAST_SKIP else 0
 
     def _ahead(self, stride: float, ahead: int) -> int:
