@@ -226,7 +226,6 @@ def test_a_compressed_image_that_is_no_depth_image_is_refused(form: str, data: b
         unpacked_depth(ROS.compressed(form, data))
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=200))
 def test_no_bytes_of_rvl_raise_anything_but_a_value_error(data: bytes) -> None:
     with suppress(ValueError):
