@@ -258,7 +258,8 @@ def test_a_policy_is_found_by_folder_file_run_or_name(
 
 
 @pytest.mark.parametrize(
-    "name", ["pull", "pull-closed-door", "pull-closed-door-sparse", "push", "push-faucet", "push-faucet-sparse"]
+    "name",
+    ["pull", "pull-closed-door", "pull-closed-door-sparse", "pull-sparse", "push", "push-faucet", "push-faucet-sparse"],
 )
 def test_the_package_brings_a_policy_with_its_card(name: str) -> None:
     policy = load_policy(name)

@@ -75,8 +75,8 @@ class AdaptCommand:
     budget: int = 4
     """The most interactions that are proposed before the final action."""
     proposer: str = "aip"
-    """What chooses these interactions: aip, as published; information-gain, which reveals more on closed doors and
-    takes half a second a step; or another proposer, such as argfps."""
+    """What chooses these interactions: aip, as published; information-gain, which reveals more on pulls and takes
+    half a second a step; or another proposer, such as argfps."""
     points: int = 2048
     """How many points of a scan the policy receives: as many as in its training (see its model card)."""
     seed: Annotated[int, Field(ge=0)] = 0
