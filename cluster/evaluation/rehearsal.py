@@ -180,8 +180,10 @@ class SimulatedRobot:
         positions = self.executed[-1].joint_positions if self.executed else self._state.start
         if len(positions) != len(self._environment.state()):
             raise UsageError(f"{self.folder / STATE}: is of another object; name another folder")
-        if self.executed:
-            self._environment.restore(np.array(positions))
+        for done in self.executed:
+            # Each look draws other points of what is seen, so those of the interrupted rehearsal are repeated.
+            self._environment.restore(np.array(done.joint_positions))
+            self._environment.observe()
 
     def _scan_path(self, number: int) -> Path:
         return self.folder / f"scan-{number + 1}.npz"

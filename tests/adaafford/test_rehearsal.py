@@ -19,12 +19,12 @@ from cluster.evaluation import rehearsal
 from cluster.evaluation.rehearsal import STATE, Executed, Setting, SimulatedRobot
 from collector.objects.procedural.catalogue import generate
 from collector.sim.depth_noise import LEVEL_M, noisy
-from collector.sim.environment import camera_for
+from collector.sim.environment import SapienEnvironment, camera_for
 from shared.config import CameraConfig
 from shared.errors import UsageError
 from shared.policies.adaptation import Adapter
 from shared.policies.proposers import ExploitProposer
-from shared.types import OutcomeKind
+from shared.types import Action, Outcome, OutcomeKind
 from tests.support.small_policies import policy_with_all
 
 TASK = "pull-closed-door"
@@ -71,6 +71,33 @@ def test_an_answer_that_comes_again_is_executed_once(make_robot: Callable[..., S
     with pytest.raises(UsageError, match="interaction 1 cannot follow 1"):
         robot.execute(step.model_copy(update={"point": (9.0, 9.0, 9.0)}))
     assert len(robot.executed) == 1
+
+
+def test_actions_are_the_same_whether_or_not_a_rehearsal_was_interrupted(
+    make_robot: Callable[..., SimulatedRobot], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    aimed = list[Action]()
+
+    def opened(environment: SapienEnvironment, action: Action) -> Outcome:
+        aimed.append(action)
+        lower, upper = environment.object.limits().T
+        environment.restore(lower + (upper - lower) * len(aimed) / 40)
+        return Outcome(OutcomeKind.OK, 0.1, True)
+
+    monkeypatch.setattr(SapienEnvironment, "execute", opened)
+    step, points = a_step(make_robot(), 1), []
+    for interrupted in (False, True):
+        for path in tmp_path.iterdir():
+            path.unlink()
+        aimed.clear()
+        robot = make_robot()
+        scan = read_scan(robot.folder / robot.request.cloud)
+        for number, point in enumerate(scan.points[scan.movable][50::2000][:12].tolist(), 1):
+            robot.execute(step.model_copy(update={"interaction": number, "point": tuple(point)}))
+            robot = make_robot() if interrupted else robot
+        points.append([tuple(action.point) for action in aimed])
+    assert points[0] == points[1]
+    assert len(set(points[0])) > 2
 
 
 def test_a_scene_is_scanned_raw_and_the_same_after_an_interruption(make_robot: Callable[..., SimulatedRobot]) -> None:
