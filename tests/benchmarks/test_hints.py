@@ -97,7 +97,7 @@ def test_the_command_counts_tries_and_draws_them(tmp_path: Path, capsys: pytest.
     setting = fabricate_setting(points=2048)
     plan = Plan(setting=setting.model_copy(update={"task": "push-faucet"}))
     store = make_store(tmp_path / "store", fabricate_rollouts(plan, Job(plan.key, 0, 6)), plan)
-    flags = ["--store", str(store.path), "--policy", "push-faucet", "--picture", str(tmp_path / "hints.png")]
+    flags = ["--store", str(store.path), "--policy", "push-faucet-sparse", "--picture", str(tmp_path / "hints.png")]
     for bad, message in (
         (["--policy", "pull-closed-door"], "a policy for 'pull-closed-door', but the tries are of 'push-faucet'"),
         (["--picture", str(tmp_path / "nowhere" / "hints.png")], "its folder is not there"),

@@ -57,14 +57,14 @@ def test_what_a_policy_has_seen_is_found_by_whatever_it_is_called(source: RunFol
 
 
 def test_the_policies_that_come_along_say_what_they_have_seen(tmp_path: Path) -> None:
-    made = {seed: tmp_path / str(seed) for seed in (1, 2)}
+    made = {seed: tmp_path / str(seed) for seed in (51, 2)}
     for seed, folder in made.items():
         generate(folder, {"Faucet": 5}, seed)
     contents = {seed: {entry.ref.content_hash for entry in scan(folder).usable} for seed, folder in made.items()}
-    # They were trained on, or judged by, 240 of 300 faucets of seed 1, and 192 of 240 of seed 31.
+    # It was trained on, or judged by, 240 of 300 faucets of seed 51.
     seen = seen_by("push-faucet")
-    assert len(seen) == 240 + 192
-    assert seen & contents[1]
+    assert len(seen) == 240
+    assert seen & contents[51]
     assert not seen & contents[2]
     assert seen_by("pull-closed-door")
 
