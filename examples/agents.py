@@ -30,7 +30,7 @@ for episode in range(episodes):
     print(f"random on {info['object_id']}: {info['episode']['r']:.0f} of {info['episode']['l']} succeed")
 
 # The same rollouts: `from_gymnasium` makes the environment one in which proposers act, as they do on a robot.
-adapter = adaafford.Adapter(adaafford.load_policy("push-faucet"))
+adapter = adaafford.Adapter(adaafford.load_policy("push-faucet-sparse"))
 robot = adaafford.from_gymnasium(env, seed=SEED)
 for episode in range(episodes):
     rng = np.random.default_rng(episode)
