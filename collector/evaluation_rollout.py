@@ -10,21 +10,34 @@ state, as in the published code. These rows come last and draw from random gener
 are the same to the last bit with and without them.
 """
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from collector.random_proposer import RandomProposer
+from collector.recorder import Recorder
 from shared import seeds
 from shared.plan import Plan
 from shared.policies.methods import MethodName, method_named
 from shared.types import Float, Interaction, Proposer, Role
 
-if TYPE_CHECKING:
-    from collector.rollout import ProposerFactory, Recorder
+
+class ProposerFactory(Protocol):
+    """Makes proposers."""
+
+    def __call__(self, name: str, rng: np.random.Generator, version: int, share: float | None = None, /) -> Proposer:
+        """Make a proposer.
+
+        Args:
+            name: of the proposer, such as "aip".
+            rng: of its random draws.
+            version: of the policy.
+            share: of a cloud's points, from which it draws its points, as far as it draws any; None: its own way.
+        """
+        ...
 
 
-def evaluate(plan: Plan, index: int, recorder: "Recorder", make_proposer: "ProposerFactory") -> None:
+def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: ProposerFactory) -> None:
     """Run every method of the plan on the environment's present state.
 
     Args:
@@ -74,7 +87,7 @@ def evaluate(plan: Plan, index: int, recorder: "Recorder", make_proposer: "Propo
 
 
 def _exploit_by_share(
-    recorder: "Recorder", method: str, tried: list[Interaction], exploiter: Proposer, budgets: list[int], start: Float
+    recorder: Recorder, method: str, tried: list[Interaction], exploiter: Proposer, budgets: list[int], start: Float
 ) -> None:
     """At each budget, execute what the method would do after its first interactions, where they began."""
     for budget in budgets:
@@ -85,7 +98,7 @@ def _exploit_by_share(
 
 
 def _adapt(
-    recorder: "Recorder",
+    recorder: Recorder,
     method: str,
     context: Proposer | None,
     exploiter: Proposer,

@@ -22,7 +22,7 @@ from collector.objects.procedural.cabinets import storage_furniture
 from collector.objects.readers import read_object
 from collector.objects.writing import write_object
 from collector.random_proposer import RepeatingProposer
-from collector.rollout import interact
+from collector.recorder import interact
 from collector.sim.environment import SapienEnvironment
 from collector.stopwatch import StageClock
 from shared import seeds

@@ -24,7 +24,8 @@ from collector.gym.spaces import (
     outcome_of,
 )
 from collector.objects.procedural import categories_of, generate
-from collector.rollout import Start, interact
+from collector.recorder import interact
+from collector.rollout import Start
 from collector.sim.camera import EmbreeCamera
 from collector.simulated_objects import SimulatedObjects
 from shared.config import CollectionConfig, StrictModel, parse
@@ -76,7 +77,7 @@ class ObjectEnv(gymnasium.Env[Values, Values]):
 
     Episode k after `reset(seed=s)` is rollout k of `adaafford collect --seed s` on the same objects: the same object,
     hidden dynamics, camera and start state, and the same outcomes of the same actions, to the last bit. It runs the
-    loop of `collector.rollout.interact` on the environment of `collector.rollout.begin`.
+    loop of `collector.recorder.interact` on the environment of `collector.rollout.begin`.
 
     The reward is 1 for a success, else 0. An episode terminates if the simulation diverges, if no point is left in view
     that may be acted on, or, with `end_at_success`, at a success. `gymnasium.make` truncates it after

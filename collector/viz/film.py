@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from collector.objects.articulation import ArticulatedObject
 from collector.random_proposer import RandomProposer
-from collector.rollout import interact
+from collector.recorder import interact
 from collector.sim.environment import SapienEnvironment
 from collector.sim.grippers import GRIPPERS
 from collector.stopwatch import StageClock

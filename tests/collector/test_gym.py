@@ -21,7 +21,8 @@ from collector.gym.spaces import NOT_EXECUTED, action_of, action_values, observa
 from collector.objects.catalogue import load_ref
 from collector.objects.procedural import generate
 from collector.random_proposer import RandomProposer
-from collector.rollout import interact, object_of, run_rollout
+from collector.recorder import interact
+from collector.rollout import object_of, run_rollout
 from collector.sim.simulator import Simulator
 from collector.simulated_objects import SimulatedObjects
 from collector.stopwatch import StageClock

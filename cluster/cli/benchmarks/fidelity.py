@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from collector.objects.catalogue import load_ref
 from collector.random_proposer import RandomProposer
-from collector.rollout import draw_rollout, interact, make_environment, object_of
+from collector.recorder import interact
+from collector.rollout import draw_rollout, make_environment, object_of
 from collector.sim.environment import SapienEnvironment, only_sapien
 from collector.sim.trial import MOTION_THRESHOLD, Trial
 from collector.stopwatch import StageClock
