@@ -10,7 +10,6 @@ import struct
 import sys
 from binascii import crc32
 from collections import Counter
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -72,6 +71,18 @@ class _Found:
             self.counts[channel] += 1
             self.start, self.end = min(self.start, time), max(self.end, time)
 
+    def add_all(self, content: bytes) -> int:
+        """Take account of the whole records in the content of a chunk; returns how many bytes these are."""
+        view, place = memoryview(content), 0
+        while place + 9 <= len(content):
+            kind, length = struct.unpack_from("<BQ", content, place)
+            end = place + 9 + length
+            if kind not in (_SCHEMA, _CHANNEL, _MESSAGE) or end > len(content):
+                break
+            self.add(kind, view[place + 9 : end])
+            place = end
+        return place
+
 
 def mended(file: BinaryIO) -> BinaryIO:
     """A file with all whole records of one that was cut off, and with an index of its chunks.
@@ -90,7 +101,7 @@ def mended(file: BinaryIO) -> BinaryIO:
             packed = file.read(min(length, size - end - 9))
             content, intact = _unpacked(packed, whole)
             chunk = _Found(described=found.described)
-            kept = _walk(content, chunk.add)
+            kept = chunk.add_all(content)
             if not (whole and intact):
                 if chunk.counts:
                     rebuilt = _plain_chunk(content[:kept], chunk)
@@ -106,26 +117,6 @@ def mended(file: BinaryIO) -> BinaryIO:
     start = end + len(rebuilt) if summary else 0
     tail = rebuilt + summary + _record(_FOOTER, struct.pack("<QQI", start, 0, 0)) + MAGIC
     return io.BufferedReader(_Continued(file, end, tail))
-
-
-def _walk(content: bytes, add: Callable[[int, memoryview], None]) -> int:
-    """Tell of each whole record in the content of a chunk; returns how many bytes these are."""
-    view, place = memoryview(content), 0
-    for kind, start, end in _records(content):
-        add(kind, view[start:end])
-        place = end
-    return place
-
-
-def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of the whole records that follow each other."""
-    place = 0
-    while place + 9 <= len(content):
-        kind, length = struct.unpack_from("<BQ", content, place)
-        if kind not in (_SCHEMA, _CHANNEL, _MESSAGE) or place + 9 + length > len(content):
-            return
-        yield kind, place + 9, place + 9 + length
-        place += 9 + length
 
 
 def _unpacked(chunk: bytes, whole: bool) -> tuple[bytes, bool]:

@@ -9,7 +9,6 @@ import io
 import os
 import re
 import struct
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -20,21 +19,15 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 from rosbags.rosbag2 import Reader
 
 from adaafford.columns import MAX_SCAN_BYTES, shown
-from adaafford.cut_mcap import is_cut, mended
+from adaafford.cut_mcap import is_cut, mended, zstd
 from adaafford.recordings import PACKED, is_storage
 from shared.errors import UsageError
 
 if TYPE_CHECKING:
-    from typing import Any, Self
+    from typing import Self
 
     from rosbags.interfaces import Connection
     from rosbags.interfaces.typing import RPath
-
-    zstd: Any
-elif sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
 
 MAX_FILES = 1000
 MAX_UNPACKED = 1 << 30
