@@ -71,21 +71,22 @@ def require_same_objects(wanted: Iterable[ObjectRef], folder: Path) -> None:
 
 def _say_refused(found: Catalogue) -> None:
     """Say which objects cannot be used for any task; that others are of no use for this one is as expected."""
-    for object_id, reason in found.refused[:MOST_NOTED]:
-        logger.warning("object %s cannot be used: %s", object_id, reason)
-    if len(found.refused) > MOST_NOTED:
-        more = len(found.refused) - MOST_NOTED
-        logger.warning("%d more objects cannot be used; `adaafford objects check` says why", more)
+    lines = [f"object {object_id} cannot be used: {reason}" for object_id, reason in found.refused]
+    _say(lines, "more objects cannot be used; `adaafford objects check` says why")
 
 
 def _say_notes(catalogue: Catalogue) -> None:
     """Say which objects are not used as their files have them."""
-    noted = [entry for entry in catalogue.usable if entry.notes]
-    for entry in noted[:MOST_NOTED]:
-        logger.warning("object %s: %s", entry.ref.id, "; ".join(entry.notes))
-    if len(noted) > MOST_NOTED:
-        more = len(noted) - MOST_NOTED
-        logger.warning("%d more objects have something left out; `adaafford objects check` says what", more)
+    lines = [f"object {entry.ref.id}: {'; '.join(entry.notes)}" for entry in catalogue.usable if entry.notes]
+    _say(lines, "more objects have something left out; `adaafford objects check` says what")
+
+
+def _say(lines: list[str], others: str) -> None:
+    """Say the first of some lines, and what is true of the others, after their number."""
+    for line in lines[:MOST_NOTED]:
+        logger.warning("%s", line)
+    if len(lines) > MOST_NOTED:
+        logger.warning("%d %s", len(lines) - MOST_NOTED, others)
 
 
 def built_in_categories(task: Task, categories: tuple[str, ...]) -> list[str]:
