@@ -177,12 +177,12 @@ class SimulatedRobot:
         return _told(self._environment.execute(action))
 
     def _restore(self) -> None:
-        positions = self.executed[-1].joint_positions if self.executed else self._state.start
-        if len(positions) != len(self._environment.state()):
+        states = [self._state.start, *(done.joint_positions for done in self.executed)]
+        if any(len(state) != len(self._environment.state()) for state in states):
             raise UsageError(f"{self.folder / STATE}: is of another object; name another folder")
-        for done in self.executed:
+        for state in states[1:]:
             # Each look draws other points of what is seen, so those of the interrupted rehearsal are repeated.
-            self._environment.restore(np.array(done.joint_positions))
+            self._environment.restore(np.array(state))
             self._environment.observe()
 
     def _scan_path(self, number: int) -> Path:
