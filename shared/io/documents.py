@@ -153,17 +153,8 @@ def with_checksum(content: dict[str, Any]) -> bytes:
     return canonical(content | {_SEAL: _checksum(content)})
 
 
-def without_checksum(data: bytes, source: str) -> dict[str, Any]:
-    """The content of a document that `with_checksum` wrote.
-
-    Raises:
-        StoreError: it is not JSON, not an object, or not what was sealed, byte for byte.
-    """
-    return checked_content(parse_object(data, source), data, source)
-
-
 def checked_content(content: dict[str, Any], data: bytes, source: str) -> dict[str, Any]:
-    """The same of a document that is parsed already.
+    """The content of a document that `with_checksum` wrote, and that is parsed already.
 
     Raises:
         StoreError: it is not what was sealed, byte for byte.

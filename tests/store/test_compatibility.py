@@ -16,7 +16,7 @@ from cluster.cli.main import run
 from collector.setting import in_fidelity_of
 from shared.config import CollectionConfig, Fidelity
 from shared.errors import SchemaVersionError, StoreError
-from shared.io.documents import with_checksum, without_checksum
+from shared.io.documents import with_checksum
 from shared.plan import Job, Plan, RolloutStatus
 from shared.store import Store, compact, export, info, merge, repair, verify
 from shared.store.codecs.columns import ROLLOUT_COLUMNS, Column
@@ -24,6 +24,7 @@ from shared.store.codecs.tables import read_table
 from shared.store.layout import Quarantined
 from shared.store.maintenance.export import splits_by_share
 from shared.store.provenance import changed_versions
+from tests.support.documents import without_checksum
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "a96b627.tar.xz"

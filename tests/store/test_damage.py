@@ -16,7 +16,7 @@ from numcodecs.blosc import Blosc
 
 from learner.data.dataset import load_dataset
 from shared.errors import StoreError
-from shared.io.documents import MAX_VALUES, canonical, parse_object, with_checksum, without_checksum
+from shared.io.documents import MAX_VALUES, canonical, parse_object, with_checksum
 from shared.networks.network_config import NetworkConfig
 from shared.plan import Job, Plan
 from shared.store import Store, info, verify
@@ -24,6 +24,7 @@ from shared.store.codecs.columns import INTERACTION_COLUMNS, MAX_JOINT_NAMES, MA
 from shared.store.codecs.observations import ARRAYS
 from shared.store.codecs.tables import read_table
 from shared.store.maintenance.repair import repair
+from tests.support.documents import without_checksum
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
 
 SETTING = fabricate_setting()

@@ -10,12 +10,13 @@ import zarr
 from shared.config import CameraConfig, CollectionConfig
 from shared.depth import DepthMap, pack_steps, unpack_steps
 from shared.errors import StoreError
-from shared.io.documents import with_checksum, without_checksum
+from shared.io.documents import with_checksum
 from shared.plan import Job, Plan, RolloutRecord, Setting
 from shared.store import Store, compact, export, merge, repair, verify
 from shared.store.codecs import observations
 from shared.store.layout import DEPTH_VERSION, SCHEMA_VERSION, StoreDocument
 from shared.store.writer import rollout_digest
+from tests.support.documents import without_checksum
 from tests.support.fabricate import fabricate_depth, fabricate_rollout, fabricate_rollouts, fabricate_setting
 
 SETTING = fabricate_setting(keep_depth=True)

@@ -20,13 +20,14 @@ from hypothesis import strategies as st
 
 from shared.config import CollectionConfig, Fidelity
 from shared.errors import StoreError, UsageError
-from shared.io.documents import with_checksum, without_checksum
+from shared.io.documents import with_checksum
 from shared.plan import Job, ObjectRef, Plan, RolloutRecord
 from shared.store import Store, info, verify
 from shared.store.codecs.columns import COPIED_COLUMNS
 from shared.store.layout import parse_shard_id
 from shared.store.writer import rollout_digest
 from shared.types import Action, HiddenDynamics, Observation, Outcome, OutcomeKind
+from tests.support.documents import without_checksum
 from tests.support.fabricate import fabricate_rollout, fabricate_rollouts, fabricate_setting, identical
 
 SETTING = fabricate_setting()
