@@ -43,7 +43,7 @@ from shared.io.text import plain
 from shared.policies.adaptation import Adapter
 from shared.policies.methods import PROPOSERS
 from shared.policies.policy import Policy
-from shared.policies.proposers import AIP_NAME, ExploitProposer, proposer_named
+from shared.policies.proposers import AipProposer, ExploitProposer, proposer_named
 from shared.primitives import PRIMITIVES
 from shared.tasks import task_named
 from shared.types import Action, Observation
@@ -209,7 +209,7 @@ class Session:
         part: str | None = None,
         lens: Lens | None = None,
         selection: Selection = WHOLE,
-        proposer: Name = AIP_NAME,
+        proposer: Name = AipProposer.name,
     ) -> None:
         policy.require("prior", "aap", *PROPOSERS.get(proposer).modules)
         self._choice = None if part is None else part_choice(part)

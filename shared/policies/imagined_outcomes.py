@@ -57,7 +57,7 @@ class _ImaginingProposer:
         scores = [self.adapter.score_proposals(observation, each, latent) for each in proposals]
         frames = torch.stack([own.frames[int(s.argmax())] for own, s in zip(proposals, scores, strict=True)])
         candidates = AskedActions(points, frames)
-        worth = self._expected(observation, candidates, self._asked(candidates, proposals), history)
+        worth = self._expected(observation, candidates, self._asked(candidates, proposals), history, latent)
 
         def choose(left: NDArray[np.int64]) -> int:
             return int(left[worth[torch.from_numpy(left)].argmax()])
@@ -77,14 +77,18 @@ class _ImaginingProposer:
         return drawn[np.sort(first)[:CANDIDATES]]
 
     def _expected(
-        self, observation: Observation, candidates: AskedActions, asked: AskedActions, history: Sequence[Interaction]
+        self,
+        observation: Observation,
+        candidates: AskedActions,
+        asked: AskedActions,
+        history: Sequence[Interaction],
+        latent: Tensor,
     ) -> Tensor:
-        """The expected worth of each candidate, [C]."""
+        """The expected worth of each candidate, [C], after a history whose z is `latent`."""
         moved = [interaction.outcome.motion for interaction in history if interaction.outcome.success]
         motion = float(np.median(moved)) if moved else USUAL_MOTION
-        latent = self.adapter.z(history)[None]
-        odds = self.adapter.beliefs(observation, *candidates, latent)[0]
-        now = self.adapter.beliefs(observation, *asked, latent)[0]
+        odds = self.adapter.beliefs(observation, *candidates, latent[None])[0]
+        now = self.adapter.beliefs(observation, *asked, latent[None])[0]
         expected = torch.zeros_like(odds)
         for chance, outcome in ((odds, (motion, True)), (1.0 - odds, (0.0, False))):
             latents = self.adapter.imagined(observation, *candidates, outcome, history)

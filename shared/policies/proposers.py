@@ -17,8 +17,6 @@ from shared.types import Action, Float32, Interaction, Observation, Proposer
 
 TOP_POINTS = 100
 """Points that an exploit is drawn from (AdaAfford, Evaluation Metrics)."""
-AIP_NAME = "aip"
-"""Of the proposer that the paper has, in `shared.policies.methods.PROPOSERS`."""
 STOP_THRESHOLD = 0.0
 """The paper says "e.g., 0.05", but the AIP score is a drop of a loss whose mean here is about 0.003, so that 0.05 would
 stop at once; 0 stops where no point promises any gain."""
@@ -37,7 +35,7 @@ class AipProposer:
     Deviation: `at_least` interactions are proposed in spite of the threshold, because an empty history reveals nothing.
     """
 
-    name = AIP_NAME
+    name = "aip"
 
     def __init__(
         self,
