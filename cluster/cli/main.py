@@ -27,6 +27,8 @@ SPINS = 30_000
 speed on a quiet machine, and its fair share of a busy one."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as a shell has it."""
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals by which users end a command."""
 
 COMMANDS = {
     "run": "a whole campaign: collect, train, collect proposed interactions, evaluate",
@@ -82,6 +84,13 @@ def main() -> NoReturn:
         code = run(args)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else _complain(str(stop.code), 1) if stop.code else 0
+    except KeyboardInterrupt:
+        # Another one, while the first was being reported.
+        code = INTERRUPTED
+    # All is done and said, so that a signal may end the process at once, without a traceback.
+    for number in ENDING:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
     sys.exit(streams.settle(code))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -161,3 +162,18 @@ def test_threads_that_wait_for_each_other_do_not_keep_a_busy_processor_for_long(
         done = subprocess.run([sys.executable, "-c", code], env=told, capture_output=True, text=True, check=True)
         assert done.stdout == f"{spins}\n"
     assert "GOMP_SPINCOUNT = '30000'" in done.stderr
+
+
+@pytest.mark.parametrize(("moment", "code"), [("main._interrupted", 130), ("main.Streams.settle", -signal.SIGINT)])
+def test_a_second_interrupt_after_a_command_ended_prints_no_traceback(moment: str, code: int) -> None:
+    script = (
+        "import signal; from cluster.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "def interrupt(*_): signal.raise_signal(signal.SIGINT)\n"
+        "main.run = lambda args: main.guarded(interrupt, ['run'])\n"
+        f"{moment} = interrupt\n"
+        "main.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr
