@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from shared.errors import StoreError, UnreadableError, UsageError
@@ -22,6 +21,7 @@ from shared.io.files import (
     read_bounded,
     remove_remnants,
     remove_tree,
+    scratch_folder,
     sync_file,
     sync_folder,
     write_atomically,
@@ -189,8 +189,8 @@ class BucketDestination:
     @contextmanager
     def begin(self, identity: dict[str, Any]) -> Iterator[None]:
         """See `Destination.begin`."""
-        with TemporaryDirectory(prefix="adaafford-export-") as staging, present(self._notes, "export", alone=True):
-            self._staging, self.folder = Path(staging), Path(staging, "out")
+        with scratch_folder("export") as staging, present(self._notes, "export", alone=True):
+            self._staging, self.folder = staging, staging / "out"
             self.folder.mkdir()
             if self.note(BEGUN) != identity:
                 for key in self._backend.leaves(""):
