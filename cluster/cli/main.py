@@ -68,7 +68,10 @@ NEEDS = {
 }
 """Extras without which a command would fail, perhaps after hours; what only some of its uses need is not among them."""
 
-RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate", "rehearse")
+RESUMABLE = (
+    *("run", "resume", "collect", "train", "learn", "evaluate", "rehearse"),
+    *("objects scenes", "store export"),
+)
 """Long work, with which the same command goes on after an interruption."""
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` shows more\n\n" + "\n".join(
@@ -98,7 +101,12 @@ def only_prints(args: list[str]) -> bool:
     """Whether a command line leaves nothing but its output, so that it can end where nobody reads that any more."""
     if {"-h", "--help", "--dry-run"}.intersection(args):
         return True
-    return not (args and args[0] in RESUMABLE) and not any(arg.partition("=")[0] == "--out" for arg in args)
+    return not _is_resumable(args) and not any(arg.partition("=")[0] == "--out" for arg in args)
+
+
+def _is_resumable(args: list[str]) -> bool:
+    """Whether a command line is long work with which the same command goes on."""
+    return any(" ".join(args[:words]) in RESUMABLE for words in (1, 2))
 
 
 def begin_process(*, stop_at_pipe: bool = False) -> Streams:
@@ -169,7 +177,7 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
 
 def _interrupted(args: list[str]) -> int:
     """Say how to go on after Ctrl-C."""
-    hint = "; committed data stay, and the same command continues" if args[0] in RESUMABLE else ""
+    hint = "; committed data stay, and the same command continues" if _is_resumable(args) else ""
     print(
         f"adaafford: interrupted{hint}: adaafford {plain(without_secrets(' '.join(args)))}"
         if hint
