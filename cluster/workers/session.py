@@ -11,6 +11,7 @@ import secrets
 import signal
 import socket
 import subprocess
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -403,7 +404,13 @@ def _session_folder() -> Iterator[Path]:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Signals that would end this process wait for the end of the context, so that a second Ctrl-C leaves nothing."""
+    """Signals that would end this process wait for the end of the context, so that a second Ctrl-C leaves nothing.
+
+    In the main thread, where Python handles signals; elsewhere none interrupts.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     received: list[int] = []
     handlers = {number: signal.getsignal(number) for number in _ENDING}
     handled = {number: handler for number, handler in handlers.items() if callable(handler)}

@@ -401,6 +401,19 @@ def test_a_signal_during_the_end_of_a_session_waits_until_nothing_is_left(
     assert list(sessions.iterdir()) == []
 
 
+def test_a_session_may_end_in_a_thread_where_no_signals_are_handled() -> None:
+    done: list[bool] = []
+
+    def end() -> None:
+        with session._undisturbed():
+            done.append(True)
+
+    thread = threading.Thread(target=end)
+    thread.start()
+    thread.join()
+    assert done == [True]
+
+
 def test_an_interrupt_while_a_session_starts_leaves_no_process(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     left: list[subprocess.Popen[bytes]] = []
 
