@@ -28,7 +28,7 @@ from learner.training import data_parallel
 from learner.training.hardware import Hardware
 from shared.errors import StoreError, UsageError
 from shared.io.documents import read_document
-from shared.io.files import write_atomically
+from shared.io.files import make_folder, write_atomically
 from shared.plan import parse_plan_key
 from shared.policies.methods import BaselineName
 from shared.store.store import Store
@@ -200,6 +200,7 @@ def alternate(rollouts: Finished, config: LearnerConfig, hardware: Hardware | No
         StoreError: see `run_stage`.
     """
     memory, out = Memory(), rollouts.out
+    make_folder(out)
     scores: list[float] = []
 
     def goes_on(number: int) -> bool:

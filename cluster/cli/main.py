@@ -27,6 +27,8 @@ SPINS = 30_000
 speed on a quiet machine, and its fair share of a busy one."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as a shell has it."""
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals by which users end a command."""
 
 COMMANDS = {
     "run": "a whole campaign: collect, train, collect proposed interactions, evaluate",
@@ -66,7 +68,10 @@ NEEDS = {
 }
 """Extras without which a command would fail, perhaps after hours; what only some of its uses need is not among them."""
 
-RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate", "rehearse")
+RESUMABLE = (
+    *("run", "resume", "collect", "train", "learn", "evaluate", "rehearse"),
+    *("objects scenes", "store export"),
+)
 """Long work, with which the same command goes on after an interruption."""
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` shows more\n\n" + "\n".join(
@@ -82,6 +87,13 @@ def main() -> NoReturn:
         code = run(args)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else _complain(str(stop.code), 1) if stop.code else 0
+    except KeyboardInterrupt:
+        # Another one, while the first was being reported.
+        code = INTERRUPTED
+    # All is done and said, so that a signal may end the process at once, without a traceback.
+    for number in ENDING:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
     sys.exit(streams.settle(code))
 
 
@@ -89,7 +101,12 @@ def only_prints(args: list[str]) -> bool:
     """Whether a command line leaves nothing but its output, so that it can end where nobody reads that any more."""
     if {"-h", "--help", "--dry-run"}.intersection(args):
         return True
-    return not (args and args[0] in RESUMABLE) and not any(arg.partition("=")[0] == "--out" for arg in args)
+    return not _is_resumable(args) and not any(arg.partition("=")[0] == "--out" for arg in args)
+
+
+def _is_resumable(args: list[str]) -> bool:
+    """Whether a command line is long work with which the same command goes on."""
+    return any(" ".join(args[:words]) in RESUMABLE for words in (1, 2))
 
 
 def begin_process(*, stop_at_pipe: bool = False) -> Streams:
@@ -160,7 +177,7 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
 
 def _interrupted(args: list[str]) -> int:
     """Say how to go on after Ctrl-C."""
-    hint = "; committed data stay, and the same command continues" if args[0] in RESUMABLE else ""
+    hint = "; committed data stay, and the same command continues" if _is_resumable(args) else ""
     print(
         f"adaafford: interrupted{hint}: adaafford {plain(without_secrets(' '.join(args)))}"
         if hint

@@ -2,13 +2,14 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from cluster.cli.main import COMMANDS, run
+from cluster.cli.main import COMMANDS, guarded, only_prints, run
 from shared.tasks import TEST_CATEGORIES
 
 
@@ -161,3 +162,40 @@ def test_threads_that_wait_for_each_other_do_not_keep_a_busy_processor_for_long(
         done = subprocess.run([sys.executable, "-c", code], env=told, capture_output=True, text=True, check=True)
         assert done.stdout == f"{spins}\n"
     assert "GOMP_SPINCOUNT = '30000'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("args", "continues"),
+    [
+        (["train", "aap", "--out", "RUN"], True),
+        (["objects", "scenes", "OBJECTS", "SCENES"], True),
+        (["store", "export", "STORE", "--out", "DATA"], True),
+        (["objects", "check", "OBJECTS"], False),
+        (["store", "verify", "STORE"], False),
+    ],
+)
+def test_an_interrupt_is_one_line_that_says_whether_the_same_command_continues(
+    args: list[str], continues: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt() -> int:
+        raise KeyboardInterrupt
+
+    assert guarded(interrupt, args) == 130
+    hint = f"; committed data stay, and the same command continues: adaafford {' '.join(args)}"
+    assert capsys.readouterr().err == f"adaafford: interrupted{hint if continues else ''}\n"
+    assert only_prints(args) is not continues
+
+
+@pytest.mark.parametrize(("moment", "code"), [("main._interrupted", 130), ("main.Streams.settle", -signal.SIGINT)])
+def test_a_second_interrupt_after_a_command_ended_prints_no_traceback(moment: str, code: int) -> None:
+    script = (
+        "import signal; from cluster.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "def interrupt(*_): signal.raise_signal(signal.SIGINT)\n"
+        "main.run = lambda args: main.guarded(interrupt, ['run'])\n"
+        f"{moment} = interrupt\n"
+        "main.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr

@@ -12,7 +12,6 @@ from dataclasses import make_dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -22,7 +21,7 @@ from cluster.config.command_settings import ObjectSelection
 from cluster.config.flags import dispatch
 from shared.config import FIDELITIES, CollectionConfig, Fidelity
 from shared.formatting import finite
-from shared.io.files import write_atomically, writing
+from shared.io.files import scratch_folder, write_atomically, writing
 from shared.progress import Progress
 
 if TYPE_CHECKING:
@@ -205,8 +204,8 @@ def _collect(command: CollectSettings) -> dict[str, Any]:
         runs = []
         with Progress(f"jobs, {command.task}", command.repeats * jobs_of(command.rollouts)) as progress:
             for _ in range(command.repeats):
-                with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
-                    store = Store.create(Path(scratch) / "store", plan.setting)
+                with scratch_folder("bench") as scratch:
+                    store = Store.create(scratch / "store", plan.setting)
                     runs.append(collect(plan, folder, command.rollouts, store, progress.advance))
         result = summary(runs)
         print_collection(result)
@@ -272,8 +271,8 @@ def planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
 
     own = {} if command.primitive is None else {"primitive": command.primitive}
     collection = command.collection.model_copy(update=own)
-    with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
-        built_in = Path(scratch) / "objects"
+    with scratch_folder("bench") as scratch:
+        built_in = scratch / "objects"
         catalogue, folder = objects_for(task, command, built_in, command.procedural_per_category, command.seed)
         refs = tuple(entry.ref for entry in catalogue.usable)
         yield Plan(setting=make_setting(task, collection, seed=command.seed, objects=refs)), folder
@@ -294,8 +293,8 @@ def stored(command: StoredSettings) -> Iterator["Store"]:
         return
     from cluster.cli.benchmarks.collecting import collect, jobs_of
 
-    with planned(command) as (plan, folder), TemporaryDirectory(prefix="adaafford-bench-") as scratch:
-        store = Store.create(Path(scratch) / "store", plan.setting)
+    with planned(command) as (plan, folder), scratch_folder("bench") as scratch:
+        store = Store.create(scratch / "store", plan.setting)
         with Progress(f"jobs of collection, {command.task}", jobs_of(command.rollouts)) as progress:
             collect(plan, folder, command.rollouts, store, progress.advance)
         yield store
