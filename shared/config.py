@@ -136,6 +136,10 @@ class Timing(StrictModel):
 PUBLISHED_TIMING = Timing(steps_per_second=500, leg_steps=2000, hold_steps=2000)
 
 
+FidelityVersion = Literal[1, 2, 3]
+"""What of a trial `fast` leaves out (docs/physics.md)."""
+
+
 class Fidelity(StrictModel):
     """How finely a trial is simulated; `fast` agrees with `reference`, the published timing, on labels."""
 
@@ -155,13 +159,14 @@ class Fidelity(StrictModel):
     """End a hold once neither hand nor object moves."""
     jointed_hand: bool = False
     """Attach the hand to six joints, as published, instead of a free body with the same drives."""
-    version: Literal[1, 2] = Field(1, exclude_if=lambda version: version == 1)
-    """2: what nothing can change is not waited for (docs/physics.md). A document that describes its fidelity without a
-    version is of 1, as collections were before there was another."""
+    version: FidelityVersion = Field(1, exclude_if=lambda version: version == 1)
+    """2: what nothing can change is not waited for; 3: nor are fingers that slide along what does not move
+    (docs/physics.md). A document that describes its fidelity without a version is of 1, as collections were before
+    there was another."""
 
 
 FIDELITIES = {
-    "fast": Fidelity(version=2),
+    "fast": Fidelity(version=3),
     "reference": Fidelity(
         name="reference",
         approach=PUBLISHED_TIMING,
