@@ -5,6 +5,7 @@ Heavy packages are imported by the subcommands that need them, so that help is i
 
 import logging
 import os
+import shlex
 import signal
 import sys
 import traceback
@@ -85,6 +86,8 @@ def main() -> NoReturn:
     streams = begin_process(stop_at_pipe=only_prints(args))
     try:
         code = run(args)
+    except _Ended as ended:
+        code = _interrupted(args, 128 + ended.number)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else _complain(str(stop.code), 1) if stop.code else 0
     except KeyboardInterrupt:
@@ -125,7 +128,7 @@ def begin_process(*, stop_at_pipe: bool = False) -> Streams:
     # As Ctrl-C does, so that workers and learners are ended in an orderly way; `nohup` has SIGHUP ignored.
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, lambda received, _: sys.exit(128 + received))
+            signal.signal(number, _end)
     return streams
 
 
@@ -175,16 +178,28 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
     return code
 
 
-def _interrupted(args: list[str]) -> int:
-    """Say how to go on after Ctrl-C."""
+class _Ended(SystemExit):
+    """SIGTERM or SIGHUP ends the command."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+        self.number = number
+
+
+def _end(number: int, frame: object) -> NoReturn:
+    raise _Ended(number)
+
+
+def _interrupted(args: list[str], code: int = INTERRUPTED) -> int:
+    """Say how to go on after a signal that ended the command; returns its exit code."""
     hint = "; committed data stay, and the same command continues" if _is_resumable(args) else ""
     print(
-        f"adaafford: interrupted{hint}: adaafford {plain(without_secrets(' '.join(args)))}"
+        f"adaafford: interrupted{hint}: adaafford {plain(without_secrets(shlex.join(args)))}"
         if hint
         else "adaafford: interrupted",
         file=sys.stderr,
     )
-    return INTERRUPTED
+    return code
 
 
 def _complain(message: str, code: int) -> int:

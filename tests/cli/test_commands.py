@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from cluster.cli.main import COMMANDS, guarded, only_prints, run
+from shared.store import Store
 from shared.tasks import TEST_CATEGORIES
+from tests.support.fabricate import fabricate_setting
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *args: str) -> str:
@@ -85,14 +87,44 @@ def test_an_unknown_preset_lists_those_there_are(capsys: pytest.CaptureFixture[s
     assert "unknown preset 'huge'; allowed: laptop, paper, smoke" in line
 
 
+def test_a_place_with_other_things_is_refused_before_objects_are_made(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.tex").write_text("x")
+    Store.create(tmp_path / "store", fabricate_setting())
+    for name, said in (("foreign", "is not empty and no store"), ("store", "holds another setting")):
+        assert said in complaint(capsys, "collect", "--store", str(tmp_path / name), "--workers", "0")
+        assert not (tmp_path / f"{name}-objects").exists()
+
+
+def test_a_picture_of_another_kind_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for action in ("preview", "film"):
+        out = tmp_path / "sheet.xyz"
+        assert f"{out}: not a kind of picture" in complaint(capsys, "objects", action, str(tmp_path), str(out))
+        assert not out.exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_says_how_to_go_on(number: signal.Signals) -> None:
+    script = (
+        "import signal, sys; from cluster.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
+        f"main.run = lambda args: main.guarded(lambda: signal.raise_signal({int(number)}), args)\n"
+        "sys.argv[1:] = ['collect', '--store', 'my store']\n"
+        "main.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 128 + number
+    assert done.stderr == (
+        "adaafford: interrupted; committed data stay, and the same command continues: "
+        "adaafford collect --store 'my store'\n"
+    )
+
+
 @pytest.mark.parametrize("args", [["--rollouts", "x"], ["--rolouts", "3"], ["--rollouts", "0"]])
 def test_bad_flags_end_with_code_2(args: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    try:
-        code = run(["collect", "--store", str(tmp_path / "store"), *args])
-    except SystemExit as stop:
-        code = int(stop.code or 0)
-    assert code == 2
-    assert "roll" in capsys.readouterr().err
+    assert "roll" in complaint(capsys, "collect", "--store", str(tmp_path / "store"), *args)
 
 
 def test_aip_needs_a_policy(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
