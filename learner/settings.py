@@ -10,6 +10,8 @@ from shared.networks.network_config import NetworkConfig
 
 METRICS_FILE = "metrics.jsonl"
 """Of a training: one line a validation."""
+OUTPUT_FILE = "output.txt"
+"""What the process of a stage printed, where a campaign started it; it is made before the stage begins."""
 PUBLISHED_FILE = "published.json"
 """Of a learner beside collection: which version each of its policies became."""
 

@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from learner.settings import OUTPUT_FILE
 from shared.errors import UsageError, WorkerError
 from shared.io.interpreter import PYTHON, own_environment
 from shared.io.redaction import without_places
@@ -23,7 +24,6 @@ THREADS = 2
 """Of torch, in a child: the collectors rest while it works."""
 PATIENCE_S = 10.0
 """How long a child may take to end when asked to."""
-OUTPUT_FILE = "output.txt"
 CHILD = "cluster.cli.child"
 """The module that a child runs."""
 ENDED = "\x1e"

@@ -28,7 +28,7 @@ from pydantic import BaseModel, Field, TypeAdapter
 from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import FrozenFeatures
 from learner.data.sampling import Split, split, without_later
-from learner.settings import METRICS_FILE, LearnerConfig
+from learner.settings import METRICS_FILE, OUTPUT_FILE, LearnerConfig
 from learner.stages.aap import train_aap
 from learner.stages.aip import train_aip
 from learner.stages.oracle import read_oracle
@@ -70,7 +70,7 @@ MAX_DONE_BYTES = 16 << 20
 """done.json names every object that was seen, in some 70 bytes each."""
 CHECKPOINT_FOLDERS = ("", ORACLE_FOLDER, AFFORDANCE_FOLDER)
 STAGE_LEAVES = "|".join(
-    map(re.escape, (CONFIG_FILE, DONE_FILE, METRICS_FILE, CHECKPOINT_FILE, *CHECKPOINT_FOLDERS[1:]))
+    map(re.escape, (CONFIG_FILE, DONE_FILE, METRICS_FILE, CHECKPOINT_FILE, OUTPUT_FILE, *CHECKPOINT_FOLDERS[1:]))
 )
 """Names in a stage's folder; one of them is there as soon as it trains."""
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from cluster.runs.subprocesses import OUTPUT_FILE, THREADS, Child
+from cluster.runs.subprocesses import THREADS, Child
+from learner.settings import OUTPUT_FILE
 from shared.errors import UsageError, WorkerError
 
 STAND_IN = "learner_stand_in"

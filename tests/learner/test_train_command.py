@@ -21,11 +21,11 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from cluster.cli.main import INTERRUPTED, run
-from cluster.runs.subprocesses import OUTPUT_FILE, Child
+from cluster.runs.subprocesses import Child
 from learner.alternation import ALTERNATION_FILE, Finished, alternate, converged
 from learner.data.dataset import load_dataset
 from learner.data.sampling import split, without_later
-from learner.settings import METRICS_FILE, AlternationConfig, LearnerConfig
+from learner.settings import METRICS_FILE, OUTPUT_FILE, AlternationConfig, LearnerConfig
 from learner.stages.jobs import DONE_FILE, LOCK_FILE, StageJob, StageName, as_json, read_policy_folder, run_stage
 from learner.training.hardware import Hardware
 from learner.training.loop import CHECKPOINT_FILE
