@@ -14,6 +14,7 @@ help:  ## List the verbs.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 15) else f"needs Python 3.11 to 3.14, not {v[0]}.{v[1]}; try make PYTHON=python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "installing about 3 GB of packages into $(VENV); several minutes"
 	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
 	touch $@
 

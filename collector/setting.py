@@ -6,7 +6,7 @@ from typing import Any
 from collector.sim.grippers import GRIPPERS
 from collector.sim.simulator import SIMULATORS
 from shared.arms.arm import ARMS, URDF, arm_of
-from shared.config import FIDELITIES, CollectionConfig, Fidelity
+from shared.config import FIDELITIES, CollectionConfig
 from shared.errors import UsageError
 from shared.extensions import added_by_packages
 from shared.plan import EvaluationConfig, Setting, found_by_name
@@ -84,8 +84,11 @@ def in_fidelity_of(where: str, begun: Setting | None, collection: CollectionConf
         begun: the store's setting; None: there is no store yet.
         collection: what is asked for.
     """
-    if begun is None or collection.fidelity != FIDELITIES["fast"] or begun.collection.fidelity != Fidelity():
+    default = FIDELITIES["fast"]
+    if begun is None or collection.fidelity != default or begun.collection.fidelity == default:
         return collection
     fidelity = begun.collection.fidelity
+    if fidelity.model_copy(update={"version": default.version}) != default:
+        return collection
     logger.warning("%s: was begun with fidelity version %d; it goes on with that", where, fidelity.version)
     return collection.model_copy(update={"fidelity": fidelity})

@@ -15,6 +15,7 @@ RUN/ of `alternate`
 
 import json
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,13 +23,14 @@ from typing import Any, Protocol
 
 from pydantic import BaseModel, Field
 
-from learner.settings import AlternationConfig, LearnerConfig
+from learner.settings import PUBLISHED_FILE, AlternationConfig, LearnerConfig
 from learner.stages.jobs import DONE_FILE, MAX_DONE_BYTES, Memory, StageJob, StageName, read_done, run_stage
 from learner.training import data_parallel
+from learner.training.checkpoint import refuse_foreign
 from learner.training.hardware import Hardware
 from shared.errors import StoreError, UsageError
 from shared.io.documents import read_document
-from shared.io.files import write_atomically
+from shared.io.files import make_folder, write_atomically
 from shared.plan import parse_plan_key
 from shared.policies.methods import BaselineName
 from shared.store.store import Store
@@ -36,6 +38,8 @@ from shared.store.store import Store
 ALTERNATION_FILE = "alternation.json"
 ADOPTED = "adopted"
 """Folder of a policy that stands in the place of the first round's."""
+LEAVES = rf"prior|{ADOPTED}|(aap|aip)-\d+|data-\d+\.json|{re.escape(PUBLISHED_FILE)}|{re.escape(ALTERNATION_FILE)}"
+"""Names in the folder of an alternation; the first is there as soon as it trains or waits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +174,7 @@ class Finished:
     """
 
     def __init__(self, job: StageJob) -> None:
+        refuse_foreign(job.out, LEAVES)
         self._job, self.out = job, job.out
         self._store = Store.open(job.store)
         # By the names of shards, which say it also where the file of a plan was lost.
@@ -200,6 +205,7 @@ def alternate(rollouts: Finished, config: LearnerConfig, hardware: Hardware | No
         StoreError: see `run_stage`.
     """
     memory, out = Memory(), rollouts.out
+    make_folder(out)
     scores: list[float] = []
 
     def goes_on(number: int) -> bool:

@@ -25,7 +25,7 @@ from learner.stages.jobs import StageJob
 from learner.training import data_parallel
 from shared.errors import StoreError
 from shared.io.documents import read_document
-from shared.io.files import read_bounded, write_atomically
+from shared.io.files import make_folder, read_bounded, write_atomically
 from shared.policies.policy import MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE
 from shared.store.backends.base import backend_of
 from shared.store.coverage import Snapshot
@@ -71,7 +71,7 @@ class Following(Finished):
         if job.train_objects is None and job.validation_objects is None:
             named = [ref.id for ref in self._store.setting.objects]
             self._job = replace(job, validation_objects=kept_for_validation(named))
-        job.out.mkdir(parents=True, exist_ok=True)
+        make_folder(job.out)
 
     def collect(self, step: Collect) -> Mapping[str, Any]:
         """Wait until collectors have made enough for the round after `step.version`, and note what there is.

@@ -128,6 +128,9 @@ class AipConfig(TrainingConfig):
     """"paper": a point encoder of its own, and L1, which finds the median gain of an interaction. "inherited": AAP's
     encoder as it is, so that a step may see ten times the rollouts, squares, which find the mean gain, and, where an
     oracle taught AAP, gains by what it expects instead of by single successes."""
+    target: Literal["loss", "beliefs"] = "loss"
+    """What an interaction is worth. "loss", as published: by how much the one that was made next lowered AAP's loss.
+    "beliefs": how far AAP's beliefs are expected to move, as Kullback-Leibler divergence, by each that may be next."""
     steps: int = Field(200, ge=1)
     validate_every: int = Field(25, ge=1)
     patience: int = Field(8, ge=1)

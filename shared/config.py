@@ -28,6 +28,8 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")]
 """Of something that a registry finds (`shared.extensions`); it stands in flags, file names and keys of plans. A store
 can be read where the package is not installed."""
 PANDA, SAPIEN = "panda", "sapien"
+VALUE_ERROR = "Value error, "
+"""What pydantic puts before the message of a check."""
 
 
 class StrictModel(BaseModel):
@@ -136,6 +138,10 @@ class Timing(StrictModel):
 PUBLISHED_TIMING = Timing(steps_per_second=500, leg_steps=2000, hold_steps=2000)
 
 
+FidelityVersion = Literal[1, 2, 3]
+"""What of a trial `fast` leaves out (docs/physics.md)."""
+
+
 class Fidelity(StrictModel):
     """How finely a trial is simulated; `fast` agrees with `reference`, the published timing, on labels."""
 
@@ -155,13 +161,14 @@ class Fidelity(StrictModel):
     """End a hold once neither hand nor object moves."""
     jointed_hand: bool = False
     """Attach the hand to six joints, as published, instead of a free body with the same drives."""
-    version: Literal[1, 2] = Field(1, exclude_if=lambda version: version == 1)
-    """2: what nothing can change is not waited for (docs/physics.md). A document that describes its fidelity without a
-    version is of 1, as collections were before there was another."""
+    version: FidelityVersion = Field(1, exclude_if=lambda version: version == 1)
+    """2: what nothing can change is not waited for; 3: nor are fingers that slide along what does not move
+    (docs/physics.md). A document that describes its fidelity without a version is of 1, as collections were before
+    there was another."""
 
 
 FIDELITIES = {
-    "fast": Fidelity(version=2),
+    "fast": Fidelity(version=3),
     "reference": Fidelity(
         name="reference",
         approach=PUBLISHED_TIMING,
@@ -259,14 +266,14 @@ class CollectionConfig(StrictModel):
     primitive: Name | None = None
     """Instead of the task's own: push, push-left, push-up, pull, pull-left, pull-up, or what a package adds."""
     gripper: Name = Field(PANDA, exclude_if=lambda name: name == PANDA)
-    """The hand: panda, suction, or what a package adds. Documents leave out the default, which was once unknown."""
+    """The hand: panda, suction, or what a package adds."""
     arm: str | None = Field(None, max_length=1000, exclude_if=lambda arm: arm is None)
     """The arm that carries the hand: panda, ur5e, what a package adds, or FILE.urdf, or FILE.urdf#LINK where LINK
     carries the hand. What it cannot reach is not executed (`unreachable`). None: the hand flies."""
     arm_known: bool = Field(True, exclude_if=lambda known: known)
     """Whether policies know the arm, so that they propose what it reaches; random interactions never do."""
     simulator: Name = Field(SAPIEN, exclude_if=lambda name: name == SAPIEN)
-    """What rollouts are simulated with: sapien, or what a package adds; left out likewise."""
+    """What rollouts are simulated with: sapien, or what a package adds."""
     camera: CameraConfig = CameraConfig()
     fidelity: Fidelity = FIDELITIES["fast"]
     collision: Collision = "hulls"
@@ -344,6 +351,8 @@ def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
         close = difflib.get_close_matches(location[-1][:MAX_WORD], known, n=1)
         hint = f"did you mean '{close[0]}'?" if close else f"allowed here: {', '.join(known)}"
         return f"unknown setting '{name}'; {hint}{more}"
+    if problem["type"] == "value_error":  # Of a check of ours, which says what was given.
+        return f"setting '{name}': {problem['msg'].removeprefix(VALUE_ERROR)}{more}"
     return f"setting '{name}': {problem['msg']}; given {_shown(problem['input'])}{more}"
 
 

@@ -30,6 +30,11 @@ def percent(share: float | None, limits: Sequence[float | None] = (), decimals: 
     return f"{100 * share:.1f}{interval}"
 
 
+def counted(count: int, one: str, several: str = "") -> str:
+    """A number of things, such as "1 shard" and "2 shards"."""
+    return f"{count} {one if count == 1 else several or f'{one}s'}"
+
+
 def number(value: float | None) -> str:
     """An integer unchanged, any other number with three decimals."""
     if value is None or math.isnan(value):

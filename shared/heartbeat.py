@@ -1,8 +1,22 @@
-"""A heartbeat: a function that a background thread calls repeatedly while work goes on."""
+"""Heartbeats: a function that a background thread calls repeatedly while work goes on, and how a reader judges them."""
 
 import threading
 import time
 from collections.abc import Callable
+
+
+def is_recent(written: float, now: float, silent_s: float) -> bool:
+    """Whether a time stamp, perhaps of another machine's clock, shows that its process was at work a moment ago.
+
+    Clocks may differ by less than `silent_s`. A time further ahead was written by a wrong clock, and would otherwise
+    count as recent until the right clock reaches it, which may take years.
+
+    Args:
+        written: the time stamp, in seconds since 1970.
+        now: by the clock of this machine.
+        silent_s: a process that has written nothing for this long has ended.
+    """
+    return abs(now - written) < silent_s
 
 
 class Heartbeat:

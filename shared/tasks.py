@@ -14,6 +14,7 @@ from pydantic import Field
 from shared.config import CollectionConfig, DynamicsRanges, Name, StrictModel, load_toml, parse
 from shared.errors import UsageError
 from shared.extensions import Registry
+from shared.primitives import PRIMITIVES
 from shared.types import Direction
 
 Word = Annotated[str, Field(min_length=1, max_length=64)]
@@ -142,6 +143,9 @@ def read_task(file: Path) -> Task:
         UsageError: the file is missing, or a setting is missing, unknown or not allowed, or the name is taken.
     """
     task = parse(Task, load_toml(file), str(file))
+    if task.primitive not in PRIMITIVES.names():
+        allowed = ", ".join(PRIMITIVES.names())
+        raise UsageError(f"{file}: unknown primitive '{task.primitive}'; allowed: {allowed}")
     if task.name in TASKS.names():
         raise UsageError(f"{file}: there is already a task '{task.name}'; choose another name")
     return task

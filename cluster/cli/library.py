@@ -1,6 +1,7 @@
 """What a Python program calls instead of the command line; `adaafford` has these names."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
     from cluster.cli.ray_source import RaySource
     from collector.gym.environment import FromGymnasium
     from collector.sim.simulator import SimEnvironment
+    from collector.simulated_objects import SimulatedObjects
     from learner.stages.jobs import StageName
+    from shared.plan import Plan
 
 
 def collect(store: str | Path, **settings: Any) -> Store:
@@ -52,12 +55,13 @@ def train(
         stage: "prior", "aap", "aip", or a baseline.
         store: folder or s3:// URL; it is only read.
         out: folder for the policy, its metrics and checkpoints.
-        init: the `out` of the stage before; every stage but the prior needs one.
+        init: the `out` of the stage before, or the name of a bundled policy; every stage but the prior needs one.
         settings: as the flags of `adaafford train`: `seed`, `device`, and so on; a group, such as `aap`, as a dict.
 
     Raises:
         AdaAffordError: as the command; the message says what to do.
     """
+    from cluster.runs.warm_start import folder_of
     from learner.settings import LearnerConfig
     from learner.stages.jobs import NEEDED, StageJob, run_stage
     from learner.stages.trainers import check_baselines
@@ -68,7 +72,7 @@ def train(
         raise UsageError(f"unknown stage '{stage}'; allowed: {', '.join(stages)}")
     config = parse(LearnerConfig, settings, "adaafford.train")
     check_baselines(config)
-    job = StageJob(stage, store=store, out=Path(out), init=None if init is None else Path(init))
+    job = StageJob(stage, store=store, out=Path(out), init=None if init is None else folder_of(str(init)))
     with hardware(config) as used:
         return run_stage(job, config, used)
 
@@ -92,6 +96,13 @@ def simulated(
         UsageError: there is no such task, hand or arm, the seed is negative, or no object of the task comes to rest in
             view of the camera.
     """
+    return (environment for environment, _ in simulated_again(objects, task, seed, gripper, arm))
+
+
+def simulated_again(
+    objects: str | Path, task: str, seed: int = 1, gripper: str = PANDA, arm: str | None = None
+) -> Iterator[tuple["SimEnvironment", Callable[[], "SimEnvironment"]]]:
+    """The environments of `simulated`, each with what makes the same one anew; raises as `simulated` does."""
     require("adaafford.simulated", "collect", without=("ray",))
     from collector.simulated_objects import SimulatedObjects
 
@@ -104,7 +115,11 @@ def simulated(
     while True:
         start = found.start(plan, first)
         first = start.draw.index + 1
-        yield start.environment
+        yield start.environment, partial(_begun, found, plan, start.draw.index)
+
+
+def _begun(found: "SimulatedObjects", plan: "Plan", index: int) -> "SimEnvironment":
+    return found.start(plan, index).environment
 
 
 def from_gymnasium(

@@ -5,6 +5,7 @@ Heavy packages are imported by the subcommands that need them, so that help is i
 
 import logging
 import os
+import shlex
 import signal
 import sys
 import traceback
@@ -27,6 +28,8 @@ SPINS = 30_000
 speed on a quiet machine, and its fair share of a busy one."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as a shell has it."""
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals by which users end a command."""
 
 COMMANDS = {
     "run": "a whole campaign: collect, train, collect proposed interactions, evaluate",
@@ -66,7 +69,10 @@ NEEDS = {
 }
 """Extras without which a command would fail, perhaps after hours; what only some of its uses need is not among them."""
 
-RESUMABLE = ("run", "resume", "collect", "train", "learn", "evaluate", "rehearse")
+RESUMABLE = (
+    *("run", "resume", "collect", "train", "learn", "evaluate", "rehearse"),
+    *("objects scenes", "store export"),
+)
 """Long work, with which the same command goes on after an interruption."""
 
 USAGE = "usage: adaafford COMMAND [ARGUMENTS]; `adaafford COMMAND --help` shows more\n\n" + "\n".join(
@@ -80,8 +86,17 @@ def main() -> NoReturn:
     streams = begin_process(stop_at_pipe=only_prints(args))
     try:
         code = run(args)
+    except _Ended as ended:
+        code = _interrupted(args, 128 + ended.number)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else _complain(str(stop.code), 1) if stop.code else 0
+    except KeyboardInterrupt:
+        # Another one, while the first was being reported.
+        code = INTERRUPTED
+    # All is done and said, so that a signal may end the process at once, without a traceback.
+    for number in ENDING:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
     sys.exit(streams.settle(code))
 
 
@@ -89,7 +104,12 @@ def only_prints(args: list[str]) -> bool:
     """Whether a command line leaves nothing but its output, so that it can end where nobody reads that any more."""
     if {"-h", "--help", "--dry-run"}.intersection(args):
         return True
-    return not (args and args[0] in RESUMABLE) and not any(arg.partition("=")[0] == "--out" for arg in args)
+    return not _is_resumable(args) and not any(arg.partition("=")[0] == "--out" for arg in args)
+
+
+def _is_resumable(args: list[str]) -> bool:
+    """Whether a command line is long work with which the same command goes on."""
+    return any(" ".join(args[:words]) in RESUMABLE for words in (1, 2))
 
 
 def begin_process(*, stop_at_pipe: bool = False) -> Streams:
@@ -108,7 +128,7 @@ def begin_process(*, stop_at_pipe: bool = False) -> Streams:
     # As Ctrl-C does, so that workers and learners are ended in an orderly way; `nohup` has SIGHUP ignored.
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, lambda received, _: sys.exit(128 + received))
+            signal.signal(number, _end)
     return streams
 
 
@@ -158,16 +178,28 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
     return code
 
 
-def _interrupted(args: list[str]) -> int:
-    """Say how to go on after Ctrl-C."""
-    hint = "; committed data stay, and the same command continues" if args[0] in RESUMABLE else ""
+class _Ended(SystemExit):
+    """SIGTERM or SIGHUP ends the command."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+        self.number = number
+
+
+def _end(number: int, frame: object) -> NoReturn:
+    raise _Ended(number)
+
+
+def _interrupted(args: list[str], code: int = INTERRUPTED) -> int:
+    """Say how to go on after a signal that ended the command; returns its exit code."""
+    hint = "; committed data stay, and the same command continues" if _is_resumable(args) else ""
     print(
-        f"adaafford: interrupted{hint}: adaafford {plain(without_secrets(' '.join(args)))}"
+        f"adaafford: interrupted{hint}: adaafford {plain(without_secrets(shlex.join(args)))}"
         if hint
         else "adaafford: interrupted",
         file=sys.stderr,
     )
-    return INTERRUPTED
+    return code
 
 
 def _complain(message: str, code: int) -> int:

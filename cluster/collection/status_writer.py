@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 
 from shared.config import StrictModel
 from shared.errors import StoreError
-from shared.heartbeat import Heartbeat
+from shared.heartbeat import Heartbeat, is_recent
 from shared.io.files import is_gone
 from shared.store.backends.base import StorageBackend
 from shared.store.layout import STATUS_FOLDER
@@ -89,7 +89,7 @@ class DriverStatus(StrictModel):
             now: seconds since 1970.
         """
         ended = self.state in ("done", "stopped") or is_gone(self.process)
-        return not ended and now - self.written < SILENT_S
+        return not ended and is_recent(self.written, now, SILENT_S)
 
 
 def read_status(place: StorageBackend) -> DriverStatus | None:

@@ -1,11 +1,16 @@
 """Settings from defaults, a preset, a file and flags; later ones replace earlier ones, and every setting has a flag."""
 
 import argparse
+import difflib
+import re
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
+from io import StringIO
 from pathlib import Path
-from types import GenericAlias
-from typing import Any, TypeVar, get_args
+from types import GenericAlias, NoneType
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import tyro
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -16,7 +21,7 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
-from shared.config import CollectionConfig, DynamicsRanges, Name, load_toml, merge, parse
+from shared.config import VALUE_ERROR, CollectionConfig, DynamicsRanges, Name, load_toml, merge, parse
 from shared.errors import UsageError
 
 PRESETS_FOLDER = Path(__file__).parent / "presets"
@@ -71,6 +76,22 @@ def _ranges_by_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | 
         instance_from_str=read,
         is_instance=lambda given: given is None or isinstance(given, DynamicsRanges),
         str_from_instance=lambda ranges: ["those of the task" if ranges is None else ", ".join(ranges.root)],
+    )
+
+
+@FLAG_TYPES.primitive_rule
+def _choice_or_default(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """List the choices of a flag that may be left out in their order, without None."""
+    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
+    if NoneType not in get_args(info.type) or len(kinds) != 1 or get_origin(kinds[0]) is not Literal:
+        return None
+    spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], info.markers))
+    if isinstance(spec, UnsupportedTypeAnnotationError):
+        return None
+    return replace(
+        spec,
+        is_instance=lambda given: given is None or spec.is_instance(given),
+        str_from_instance=lambda given: ["None"] if given is None else spec.str_from_instance(given),
     )
 
 
@@ -135,7 +156,7 @@ def parse_flags(
     *,
     program: str = "adaafford ",
 ) -> Command:
-    """Parse `args` as `command`; a mistake in the flags themselves ends the process with code 2.
+    """Parse `args` as `command`; --help ends the process.
 
     Args:
         command: declares the flags.
@@ -145,15 +166,20 @@ def parse_flags(
         program: text before the subcommand in the usage text.
 
     Raises:
-        UsageError: a value is of the right type but not allowed.
+        UsageError: a flag is unknown or missing, or a value is not allowed.
     """
+    read = partial(tyro.cli, command, prog=f"{program}{prog}", default=default, config=FLAG_STYLE, registry=FLAG_TYPES)
+    said = StringIO()
     try:
-        parsed = tyro.cli(
-            command, prog=f"{program}{prog}", args=args, default=default, config=FLAG_STYLE, registry=FLAG_TYPES
-        )
+        with redirect_stderr(said):
+            parsed: Command | None = read(args=args)
         if is_dataclass(parsed):
             # tyro does not look at the bounds of a dataclass's own fields.
             TypeAdapter(command).validate_python({each.name: getattr(parsed, each.name) for each in fields(parsed)})
+    except SystemExit as stop:
+        if stop.code != WRONG_FLAGS:
+            raise
+        raise UsageError(f"{_line_of(said.getvalue(), read)}; `{program}{prog} --help` says more") from None
     except ValidationError as error:
         problem = error.errors()[0]
         if isinstance(cause := problem.get("ctx", {}).get("error"), UsageError):
@@ -162,6 +188,88 @@ def parse_flags(
         raise UsageError(f"flag for '{name}': {problem['msg']}; given {str(problem['input'])[:80]!r}") from None
     assert parsed is not None
     return parsed
+
+
+def _line_of(box: str, read: Callable[..., object]) -> str:
+    """What tyro says in a box about wrong flags, as one line.
+
+    Args:
+        box: what it printed: a text, below which there is help after a rule.
+        read: parses arguments; gives the known flags by its --help.
+    """
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines()
+    # Where the terminal's encoding has no frames, the title is a row with a rule below it.
+    framed = [line for line in lines if line.startswith("│")] or lines[2:]
+    rows = [line[2:].rstrip(" │") for line in framed]
+    whole = "\n".join(row if row.strip("─-") else RULE for row in rows)
+    text = whole.partition(RULE)[0]
+    if "Unrecognized options:" in box:
+        unknown = whole.partition("Unrecognized options:")[2].partition(RULE)[0].replace(",", " ").split()
+        wrong = next((word for word in unknown if word.startswith("-")), unknown[0])
+        return f"unknown {wrong[:80]}{_near(wrong, read)}"
+    if text.startswith("Missing from"):
+        return f"missing: {', '.join(re.findall(r'^    (?! )(.+)$', text, re.MULTILINE))}"
+    if found := re.search(SETTING, text, re.DOTALL):
+        return _of_setting(*(" ".join((part or "").split()) for part in found.groups()))
+    text = " ".join(text.split())
+    for pattern, line in ONE_LINE:
+        if found := re.search(pattern, text):
+            return line(*found.groups())
+    return text.removesuffix(".") or "the flags are wrong"
+
+
+def _near(wrong: str, read: Callable[..., object]) -> str:
+    """The known flag that is most like a wrong one, as a question; nothing where none is."""
+    helped = StringIO()
+    with redirect_stdout(helped), suppress(SystemExit):
+        read(args=["--help"])
+    near = difflib.get_close_matches(wrong, re.findall(r"(?<![\w-])--[a-z][\w.-]*", helped.getvalue()), n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _flag(name: str) -> str:
+    """A flag as it is written, from the place of its value."""
+    return name if name.startswith("-") else f"--{name.removeprefix('settings.').replace('_', '-')}"
+
+
+def _of_setting(name: str, below: str, problem: str, given: str) -> str:
+    flag = _flag(f"{name}.{below}" if below else name)
+    told = "" if problem.startswith(VALUE_ERROR) else f"; given {given}"
+    return f"{flag}: {problem.removeprefix(VALUE_ERROR)}{told}"
+
+
+def _of_several_kinds(name: str, kinds: str, given: str) -> str:
+    kinds = kinds.removeprefix("{None}|").removesuffix("|{None}").strip("{}")
+    allowed = ", ".join(sorted(kinds.split(","))) if "," in kinds else kinds
+    return f"{_flag(name)}: given {' '.join(re.findall(QUOTED, given))}; allowed: {allowed}"
+
+
+RULE = "\0"
+WRONG_FLAGS = 2
+"""Exit code of tyro."""
+QUOTED = r"'([^']*)'"
+SETTING = (
+    r"Error parsing (\S+): \d+ validation\s+errors?\s+for\s+\w+\n(?:(\S+)\n)?  (\S.*?)\s\[type=.*?"
+    r"input_value=(.*?),\s+input_type="
+)
+"""What pydantic says about a setting, whose name has a row of its own."""
+ONE_LINE: tuple[tuple[str, Callable[..., str]], ...] = (
+    (r"Error parsing (\S+): no type matching (.+?) could be instantiated from \[(.*?)\]\.", _of_several_kinds),
+    (
+        r"Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)",
+        lambda name, given: f"{_flag(name)}: given {given}; allowed: a whole number",
+    ),
+    (
+        r"Error parsing (\S+): could not convert string to float: (.*)",
+        lambda name, given: f"{_flag(name)}: given {given}; allowed: a number",
+    ),
+    (
+        r"invalid choice '(.*?)' for argument '(\S+)'\. Expected one of \((.*)\)",
+        lambda given, name, choices: f"{name}: given '{given}'; allowed: {choices.replace(chr(39), '').strip(', ')}",
+    ),
+    (r"Error parsing (\S+): (.*)", lambda name, problem: f"{_flag(name)}: {problem}"),
+)
+"""What tyro says about a value, and the line that says it."""
 
 
 def dispatch(name: str, actions: Mapping[str, Action], args: list[str], operand: str) -> int:

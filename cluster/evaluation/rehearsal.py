@@ -91,6 +91,8 @@ class SimulatedRobot:
 
     Args:
         environment: at rest, with the object in view; the same for the same setting.
+        again: makes it anew. Each interaction is in an environment in which none was before, as after an interruption:
+            a state that is restored does not remove all that the engine keeps of earlier interactions.
         setting: of the rehearsal.
         folder: for scans and state; what is there already is continued.
 
@@ -102,8 +104,11 @@ class SimulatedRobot:
         UsageError: the folder has the state of another rehearsal, or a file that is none.
     """
 
-    def __init__(self, environment: SimEnvironment, setting: Setting, folder: Path) -> None:
-        self._environment, self.folder = environment, folder
+    def __init__(
+        self, environment: SimEnvironment, again: Callable[[], SimEnvironment], setting: Setting, folder: Path
+    ) -> None:
+        self._environment, self._again, self.folder = environment, again, folder
+        self._used = False
         self._config = CameraConfig()
         self.base: tuple[float, float, float, float] | None = None
         self._origin = BASE
@@ -168,6 +173,10 @@ class SimulatedRobot:
 
     def _try(self, step: Step) -> TriedOutcome:
         """Execute an action that was chosen on a noisy scan, at the nearest point that is seen."""
+        if self._used:
+            self._environment = self._again()
+            self._restore()
+        self._used = True
         observed = self._environment.observe()
         frame = ScanFrame(camera=(0.0, 0.0, 0.0), origin=self._origin)
         try:
@@ -180,8 +189,9 @@ class SimulatedRobot:
         states = [self._state.start, *(done.joint_positions for done in self.executed)]
         if any(len(state) != len(self._environment.state()) for state in states):
             raise UsageError(f"{self.folder / STATE}: is of another object; name another folder")
+        self._environment.observe()
         for state in states[1:]:
-            # Each look draws other points of what is seen, so those of the interrupted rehearsal are repeated.
+            # Each look draws other points of what is seen, so the earlier ones are repeated.
             self._environment.restore(np.array(state))
             self._environment.observe()
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from learner.evaluation.table import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
 from shared.formatting import csv_table, markdown_table, percent
-from shared.io.files import write_atomically
+from shared.io.files import make_folder, write_atomically
 from shared.io.text import markdown
 from shared.policies.methods import METHODS, MethodName
 
@@ -150,7 +150,7 @@ def share_of_gap(low: float, value: float, high: float) -> float:
 
 def write_tables(out: Path, table: EvaluationTable) -> None:
     """Write the three files; results.json comes last, so that where it is, all are."""
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     write_atomically(out / CSV_FILE, csv_table(table.rows, _ONLY_FOR_PROGRAMS).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(table).encode())
     write_atomically(out / RESULTS_FILE, json.dumps(asdict(table), allow_nan=False).encode())

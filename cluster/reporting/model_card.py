@@ -17,7 +17,6 @@ from shared.io.files import (
     TEMPORARY_PREFIX,
     make_folder,
     read_bounded,
-    remove_remnants,
     write_atomically,
     writing,
 )
@@ -159,7 +158,6 @@ def write_export(out: Path, files: Mapping[str, bytes]) -> None:
     check_export_folder(out)
     make_folder(out)
     with writing(out, "correct this, or name another folder"):
-        remove_remnants(out)
         for name, data in files.items():
             write_atomically(out / name, data)
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from cluster.config.campaign_config import CampaignConfig
@@ -16,7 +15,7 @@ from cluster.reporting.trial_sections import failures_section, proposals_section
 from cluster.runs.run_folder import RunFolder, read_json
 from cluster.runs.run_log import RunLog
 from shared.errors import UsageError
-from shared.io.files import read_bounded, write_atomically
+from shared.io.files import make_folder, read_bounded, scratch_folder, write_atomically
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
 from shared.store import Store
@@ -63,6 +62,7 @@ def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say
         sections=tuple(sections),
         facts=_facts(summary, run),
     )
+    make_folder(run.path)
     write_atomically(run.page, render(page).encode())
 
 
@@ -86,8 +86,8 @@ def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Call
     except UsageError as error:
         say(str(error))
         return _not_tried(run)
-    with TemporaryDirectory(prefix="adaafford-report-") as folder:
-        return hidden_facts_section(Counterfactuals(setting, adapter), target, hinge_twins(setting, Path(folder)), say)
+    with scratch_folder("report") as folder:
+        return hidden_facts_section(Counterfactuals(setting, adapter), target, hinge_twins(setting, folder), say)
 
 
 def _not_tried(run: RunFolder) -> Section:

@@ -28,7 +28,7 @@ from cluster.config.campaign_config import EXECUTION_SETTINGS, CampaignConfig
 from shared.config import StrictModel, parse
 from shared.errors import UsageError
 from shared.io.documents import differences, parse_object
-from shared.io.files import create_exclusively, read_bounded, remove_remnants, write_atomically
+from shared.io.files import create_exclusively, make_folder, read_bounded, write_atomically
 from shared.plan import ObjectRef
 from shared.software import software_versions
 
@@ -145,8 +145,7 @@ def begin(path: Path, config: CampaignConfig) -> RunFolder:
         raise UsageError(f"{path}: not a folder; name a new one")
     if not run.config.exists() and path.exists() and any(_foreign(path)):
         raise UsageError(f"{path}: holds something that is not a run; name a new or an empty folder")
-    path.mkdir(parents=True, exist_ok=True)
-    remove_remnants(path)
+    make_folder(path)
     if not run.config.exists():
         # First, since with config.json a run has begun.
         _write_places(run, settings)

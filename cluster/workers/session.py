@@ -11,6 +11,7 @@ import secrets
 import signal
 import socket
 import subprocess
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -74,6 +75,8 @@ _SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 """How a connection of HTTP/2 begins: the client's preface, and a frame of settings, here of none."""
 _SHARED_MEMORY = Path("/dev/shm")  # noqa: S108
 _OWNER_FILE = "owner"
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals by which users end a command."""
 
 WorkerGroupMaker = Callable[[WorkerFactory, CrashLog], WorkerGroup]
 """Makes a worker group from a worker factory and the crash log for its heartbeats."""
@@ -263,16 +266,18 @@ def _started_session(workers: int, *, lean: bool) -> Iterator[None]:
             others = psutil.Process().children(recursive=True)
             try:
                 _start_on_loopback(workers, folder, lean=lean)
-            except WorkerError:
-                ray.shutdown()
-                _kill(set(psutil.Process().children(recursive=True)) - set(others))
+            except BaseException:  # An interrupt, too.
+                with _undisturbed():
+                    ray.shutdown()
+                    _kill(set(psutil.Process().children(recursive=True)) - set(others))
                 raise
         try:
             yield
         finally:
-            processes = _processes_of_ray()
-            ray.shutdown()
-            psutil.wait_procs(processes, AGENTS_S)
+            with _undisturbed():
+                processes = _processes_of_ray()
+                ray.shutdown()
+                psutil.wait_procs(processes, AGENTS_S)
 
 
 def _start_on_loopback(workers: int, folder: Path, *, lean: bool) -> None:
@@ -393,7 +398,31 @@ def _session_folder() -> Iterator[Path]:
     try:
         yield folder
     finally:
-        _remove_session(folder)
+        with _undisturbed():
+            _remove_session(folder)
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Signals that would end this process wait for the end of the context, so that a second Ctrl-C leaves nothing.
+
+    In the main thread, where Python handles signals; elsewhere none interrupts.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    received: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in _ENDING}
+    handled = {number: handler for number, handler in handlers.items() if callable(handler)}
+    for number in handled:
+        signal.signal(number, lambda one, _: received.append(one))
+    try:
+        yield
+    finally:
+        for number, handler in handled.items():
+            signal.signal(number, handler)
+    if received:
+        signal.raise_signal(received[0])
 
 
 def _owner_is_gone(folder: Path) -> bool:

@@ -1,9 +1,8 @@
 """A simulated object as a Gymnasium environment: an episode is a rollout, and a step is one interaction."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from shutil import rmtree
-from tempfile import mkdtemp
 from typing import Annotated, Any, Literal
 from weakref import finalize
 
@@ -31,6 +30,7 @@ from collector.simulated_objects import SimulatedObjects
 from shared.config import CollectionConfig, StrictModel, parse
 from shared.errors import UsageError
 from shared.extras import require_packages
+from shared.io.files import scratch_folder
 from shared.plan import Plan
 from shared.tasks import Task, task_of
 from shared.types import Action, Interaction, Observation, Outcome, OutcomeKind
@@ -101,8 +101,9 @@ class ObjectEnv(gymnasium.Env[Values, Values]):
             require_packages("render_mode of a Gymnasium environment", "matplotlib")
         task, objects = task_of(chosen.task), chosen.objects
         if not isinstance(objects, Path):
-            made = Path(mkdtemp(prefix="adaafford-"))
-            self._delete = finalize(self, rmtree, made, ignore_errors=True)
+            stack = ExitStack()
+            made = stack.enter_context(scratch_folder("objects"))
+            self._delete = finalize(self, stack.close)
             generate(made, objects or _procedural(task), chosen.objects_seed)
             objects = made
         self._objects = SimulatedObjects(objects, task, chosen.collection)

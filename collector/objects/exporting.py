@@ -23,7 +23,7 @@ from collector.objects.writing import (
     write_folder,
 )
 from collector.sim.engine import cooked
-from shared.io.files import writing
+from shared.io.files import remove_remnants, writing
 from shared.types import Float
 
 Format = Literal["urdf", "mjcf"]
@@ -69,6 +69,7 @@ def export_object(target: ArticulatedObject, format: Format, folder: Path, part_
         files[MAIN_FILES[format]] = _text(_mjcf(target.ref.id, model, inertials, files))
     with writing(folder, "name a folder that can"):
         folder.parent.mkdir(parents=True, exist_ok=True)
+        remove_remnants(folder.parent)
         write_folder(folder, files)
     return folder / MAIN_FILES[format]
 

@@ -128,7 +128,7 @@ def write_folder(folder: Path, files: Mapping[str, str]) -> Path:
         OSError: it cannot be written.
     """
     if folder.exists():
-        if _holds(folder, files):
+        if holds(folder, files):
             return folder
         raise UsageError(f"{folder}: holds another object, or one of another seed or mass; name another folder")
     # Readers pass over hidden folders, so a kill leaves nothing that could be taken for an object.
@@ -142,14 +142,14 @@ def write_folder(folder: Path, files: Mapping[str, str]) -> Path:
             partial.rename(folder)
         except OSError:
             # Another process may have written the same object meanwhile.
-            if not _holds(folder, files):
+            if not holds(folder, files):
                 raise
     finally:
         remove_tree(partial)
     return folder
 
 
-def _holds(folder: Path, files: Mapping[str, str]) -> bool:
+def holds(folder: Path, files: Mapping[str, str]) -> bool:
     """Whether the folder holds these very files."""
     for name, text in files.items():
         path = folder / name

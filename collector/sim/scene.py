@@ -13,6 +13,7 @@ from collector.objects.articulation import ArticulatedObject, Joint
 from collector.sim.engine import Assembly, Link, new_scene, physx, pose, sapien, set_mass
 from collector.sim.grippers import GRIPPERS
 from collector.sim.mechanisms import FRICTION_DAMPING, Holds
+from collector.sim.shortcuts import CONTACT_RANGE, SHORTCUTS
 from shared.config import PANDA, Fidelity, Timing
 from shared.hidden import HIDDEN_PARAMETERS
 from shared.primitives import PrimitiveSpec
@@ -21,11 +22,6 @@ from shared.types import Direction, Float, HiddenDynamics
 RESTITUTION = 0.01
 CONTACT_FORCE = 5.0
 """N. The published rule counts contact points with a squared impulse above 1e-4; at its 1/500 s that is this force."""
-CONTACT_RANGE = 0.02
-"""The engine lists pairs that are closer than this: the sum of two shapes' contact offsets."""
-PART_RANGE = 0.004
-"""Two parts of the object, from fidelity version 2. Parts of closed furniture are close to each other throughout, and
-listing them takes more time than all else. Between parts and hand the range stays `CONTACT_RANGE`."""
 TOUCHING = 1e-3
 """Pairs further apart exert no force: until it touches something, the hand moves by a tenth of this a step. (Each force
 that is read costs as much as the rest of its pair.)"""
@@ -99,8 +95,7 @@ class Scene:
         self.gripper = GRIPPERS.get(gripper).build(self._scene, self._material, fidelity.jointed_hand)
         self._hand = {self.gripper.palm, *self.gripper.fingers}
         self._fidelity = fidelity
-        if fidelity.version > 1:
-            self._shorten_ranges()
+        self._set_ranges(SHORTCUTS[fidelity.version].part_range)
         self._impulse_squared = 0.0
         self.limits = target.limits()
         self.park()
@@ -115,9 +110,9 @@ class Scene:
         """SAPIEN's joints of the movable parts, in part order."""
         return self._joints
 
-    def _shorten_ranges(self) -> None:
-        """Give parts of the object `PART_RANGE` among themselves, and the hand what is missing to `CONTACT_RANGE`."""
-        own = PART_RANGE / 2
+    def _set_ranges(self, of_parts: float) -> None:
+        """Let parts of the object look out for each other from `of_parts`, and for the hand from `CONTACT_RANGE`."""
+        own = of_parts / 2
         for links, offset in ((self._links, own), (self._hand, CONTACT_RANGE - own)):
             for shape in (shape for link in links for shape in link.collision_shapes):
                 shape.contact_offset = offset

@@ -6,7 +6,8 @@ import numpy as np
 
 from collector.sim.gripper import GRASP_OPENING, still
 from collector.sim.scene import Scene
-from shared.config import PUBLISHED_TIMING, Fidelity, Timing
+from collector.sim.shortcuts import REST_MOTION, REST_STEPS, SHORTCUTS
+from shared.config import Fidelity
 from shared.primitives import START_DISTANCE, Leg, PrimitiveSpec, hand_start
 from shared.types import Action, Float, Outcome, OutcomeKind
 
@@ -20,21 +21,10 @@ CLEARANCE = 3e-4
 """Free flight ends this far before the object."""
 LEAST_SKIP = 4
 """Steps of free flight; to skip fewer would cost more than to simulate them."""
-REST_STEPS, REST_MOTION = 8, 1.2e-5
-"""A hold may end when hand and object moved by less than the second a step over the first; at the time constant of the
-hand's drives (24 steps of the fast approach, 48 of its drag) less than 0.6 mm is then left to come."""
-FOLLOWED_MOTION = 5e-5
-"""A hold that another motion follows may end earlier from fidelity version 2: when no coordinate of the hand changed by
-more than this a step. What is left to come of it comes during that motion."""
-PREPARING, DECISIVE = (16, 0.4), (4, 0.2)
-"""From fidelity version 2: how many steps of its leg the target of a hand moves at once, at most, while the hand moves
-by less than the second times what its target moves. First for a leg that another one follows, where each time step adds
-3.3 N or less; then for the last, which decides, with 0.8 N."""
 JOINT_YIELDS = 3e-6
-"""And while no joint moves by more than this a step."""
-FIRST_STEP = Timing(steps_per_second=PUBLISHED_TIMING.steps_per_second, leg_steps=500, hold_steps=0)
-"""From fidelity version 2, at the pace of the fast approach: how hard overlapping shapes press in a step depends on its
-length, and so does which overlap is a start collision."""
+"""A joint that moves by more than this a step gives way, and the target of the hand moves as its timing says."""
+UNMOVED = 1e-4
+"""rad or length: by how much joints may creep while a hand that slides along them moves faster."""
 SANE_POSITION = 1e3
 """A joint position beyond this means that the simulation diverged."""
 
@@ -71,6 +61,7 @@ class Trial:
         self._judged = scene.holds.judged(target) - 1
         self.primitive = primitive
         self.fidelity = fidelity
+        self._shortcuts = SHORTCUTS[fidelity.version]
         self.steps = 0
         self._checked = False
         self._brushed = False
@@ -83,6 +74,9 @@ class Trial:
         self._stood: tuple[int, Float] | None = None
         self._hand_at = still()
         self._opening = float("nan")
+        self._gripped_at: Float | None = None
+        self._slides = False
+        self._pace = 1
 
     def run(self) -> Outcome:
         """Execute the primitive and judge it; the scene is left as the trial leaves it, the hand parked."""
@@ -128,6 +122,7 @@ class Trial:
             if not gripper.holds():
                 raise _TrialEndedError(OutcomeKind.NO_GRASP)
             self._grasps = True
+            self._gripped_at = self.scene.coordinates()
         if then is not None:
             self._timing = self.fidelity.drag
             self.scene.set_timing(self._timing)
@@ -145,11 +140,17 @@ class Trial:
         gripper.drive_velocity(velocity)
         step, ahead = 0, 1
         while step < steps:
+            self._set_pace(ahead if self._slides else 1, velocity)
             step += ahead
             gripper.drive(path[step])
             self._step()
-            rests = self._checked and ahead == 1 and step % REST_STEPS == 0 and self._object_rests()
-            if rests and self._grasps and self.fidelity.version > 1 and not gripper.holds():
+            rests = (
+                self._checked
+                and ahead == self._pace
+                and step // REST_STEPS > (step - ahead) // REST_STEPS
+                and self._object_rests()
+            )
+            if rests and self._grasps and self._shortcuts.follows_fingers and not gripper.holds():
                 raise _TrialEndedError(self._kind())
             if (
                 flies
@@ -158,11 +159,19 @@ class Trial:
                 and (skipped := self._free_flight(path, step, stride))
             ):
                 step += skipped
-                gripper.shift(path[step], velocity)
+                gripper.shift(path[step], velocity * self._pace)
             ahead = min(self._ahead(stride, ahead), steps - step)
+        self._set_pace(1, velocity)
         gripper.drive(end)
         gripper.drive_velocity(still())
         self._hand_at = end
+
+    def _set_pace(self, pace: int, velocity: Float) -> None:
+        """Let the hand move `pace` times faster than with `velocity`, [4], that of its timing, and at equal forces."""
+        if pace != self._pace:
+            self._pace = pace
+            self.scene.gripper.set_pace(self._timing.pace * pace)
+            self.scene.gripper.drive_velocity(velocity * pace)
 
     def _free_flight(self, path: Float, step: int, stride: float) -> int:
         """How many steps after `step` of the leg along `path`, [steps + 1, 4], will touch and move nothing.
@@ -187,15 +196,16 @@ class Trial:
     def _ahead(self, stride: float, ahead: int) -> int:
         """How many steps of its leg the target moves at the next step of the engine.
 
-        Twice as many as last time while hand and object stand still, since what holds them up then only bears more; one
-        otherwise. Every fourth step is looked at, or every one where the target moves by more.
+        Twice as many as last time while hand and object stand still, since what holds them up then only bears more, or
+        while closed fingers slide along an object that has not moved since they closed; one otherwise. Every fourth
+        step is looked at, or every one where the target moves by more.
 
         Args:
             stride: how far the hand's target moves in a step of the leg.
             ahead: how many it moved last time.
         """
         touched = self._checked or self._brushed
-        if self.fidelity.version < 2 or not touched or (ahead == 1 and self.steps % 4):
+        if not touched or (ahead == 1 and self.steps % 4):
             return 1
         before, now = self._stood, self.scene.coordinates()
         self._stood = self.steps, now
@@ -204,13 +214,17 @@ class Trial:
         moved, span = np.abs(now - before[1]), self.steps - before[0]
         joints = len(self.scene.joints)
         prepares = self._timing is self.fidelity.approach and self.primitive.then is not None
-        most, share = PREPARING if prepares else DECISIVE
-        if (
-            moved[joints:].max(initial=0.0) >= share * stride * ahead * span
-            or moved[:joints].max() >= JOINT_YIELDS * span
-        ):
+        strides = self._shortcuts.preparing if prepares else self._shortcuts.decisive
+        stands = moved[joints:].max(initial=0.0) < strides.share * stride * ahead * span
+        self._slides = (
+            self._shortcuts.sliding > 1
+            and self._gripped_at is not None
+            and not self._attached
+            and bool(np.abs(now - self._gripped_at)[:joints].max() < UNMOVED)
+        )
+        if moved[:joints].max() >= JOINT_YIELDS * span or not (stands or self._slides):
             return 1
-        return min(2 * ahead, most)
+        return min(2 * ahead, self._shortcuts.sliding if self._slides else strides.most)
 
     def _object_rests(self) -> bool:
         """Whether no joint has moved since this was asked last, `REST_STEPS` ago or more."""
@@ -243,19 +257,19 @@ class Trial:
     def _came_to_rest(self, moved: Float, last: bool) -> bool:
         """Whether a hold may end when `scene.coordinates` changed by `moved` in `REST_STEPS`."""
         joints = len(self.scene.joints)
-        of_hand = REST_MOTION if last or self.fidelity.version < 2 else FOLLOWED_MOTION
+        of_hand = REST_MOTION if last else self._shortcuts.followed_motion
         moved = np.abs(moved) / REST_STEPS
         return bool(moved[:joints].max() < REST_MOTION and moved[joints:].max(initial=0.0) < of_hand)
 
     def _stays_open(self, before: float, now: float, steps: int) -> bool:
         """Whether closing fingers still hold something if their opening goes on from `before` to `now` for `steps`."""
         lost = (before - now) / REST_STEPS * steps
-        return self.fidelity.version < 2 or lost <= 0 or now - lost > GRASP_OPENING
+        return not self._shortcuts.follows_fingers or lost <= 0 or now - lost > GRASP_OPENING
 
     def _step(self) -> None:
-        first = self.steps == 0 and self.fidelity.version > 1
-        if first:
-            self.scene.set_timing(FIRST_STEP)
+        first = self._shortcuts.first_step if self.steps == 0 else None
+        if first is not None:
+            self.scene.set_timing(first)
         self.scene.step()
         self.steps += 1
         if self._closed:
@@ -263,7 +277,7 @@ class Trial:
             self._brushed = self._brushed or self._attached
         if not self._checked:
             self._check_first_contact()
-        if first:
+        if first is not None:
             self.scene.set_timing(self._timing)
 
     def _kind(self) -> OutcomeKind:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learner.data.dataset import Dataset
+from learner.data.dataset import Dataset, Rows
 from shared.networks.aap import Aap
 from shared.networks.pointnet2 import CloudBatch, PointNet2
 from shared.networks.prior import Prior
@@ -164,6 +164,7 @@ class FrozenAap:
 
     Attributes:
         aap: frozen.
+        rows: of the data set.
         features: of the rows' points, [I, point_width].
         pool_features: of the pool's points, [O, P, point_width].
         codes: z_I of the rows, [I, latent_width].
@@ -171,6 +172,7 @@ class FrozenAap:
     """
 
     aap: Aap
+    rows: Rows
     features: Tensor
     pool_features: Tensor
     codes: Tensor
@@ -184,8 +186,38 @@ class FrozenAap:
         rows, features = known.dataset.rows, known.rows(aap.encoder)
         tries = (features, rows.xyz, rows.frame, rows.motion, rows.success, rows.details)
         codes, weights = aap.interaction_codes(*tries)
-        return cls(aap, features, known.pool(aap.encoder), codes, weights)
+        return cls(aap, rows, features, known.pool(aap.encoder), codes, weights)
 
     def latents(self, tries: Tensor) -> Tensor:
         """The z of every prefix of ordered rows `tries`, [..., K]; [..., K + 1, latent_width]."""
         return self.aap.prefix_latents(self.codes[tries], self.weights[tries])
+
+    def logits(self, asked: Tensor, latents: Tensor) -> Tensor:
+        """Logits of s_u|z of the actions of rows `asked`, [...], under z, [..., latent_width], which broadcast."""
+        return self.aap.action_logits(self.features[asked], self.rows.xyz[asked], self.rows.frame[asked], latents)
+
+    def imagined(self, candidates: Tensor, success: bool) -> tuple[Tensor, Tensor]:
+        """Codes and weights of rows, [...], had they succeeded, or failed, each with the usual motion of such a one.
+
+        What else an outcome tells (see `shared.networks.actions.outcome_details`) is unknown.
+        """
+        rows = self.rows
+        alike = rows.motion[(rows.success > 0) == success]
+        motion = (alike.median() if len(alike) else rows.motion.new_tensor(0.0)).expand(candidates.shape)
+        found = (self.features[candidates], rows.xyz[candidates], rows.frame[candidates])
+        return self.aap.interaction_codes(*found, motion, torch.full_like(motion, float(success)))
+
+    def latents_with(self, made: Tensor, codes: Tensor, weights: Tensor) -> Tensor:
+        """The z of rows `made`, [..., K], and one more interaction, for each of C, [..., C, latent_width].
+
+        Args:
+            made: rows.
+            codes: of the further interactions, [..., C, latent_width].
+            weights: likewise, [..., C].
+        """
+        shape = (*codes.shape[:-1], made.shape[-1])
+        before = self.codes[made][..., None, :, :].expand(*shape, -1)
+        before_weights = self.weights[made][..., None, :].expand(shape)
+        return self.aap.prefix_latents(
+            torch.cat([before, codes[..., None, :]], dim=-2), torch.cat([before_weights, weights[..., None]], dim=-1)
+        )[..., -1, :]

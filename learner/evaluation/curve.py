@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from learner.data.dataset import Dataset
 from learner.data.features import FrozenAap, FrozenFeatures, FrozenPrior
@@ -29,6 +28,7 @@ from learner.stages.oracle import OracleCritic
 from learner.training.losses import action_scoring_losses
 from shared.networks.aip import Aip
 from shared.networks.prior import Prior
+from shared.policies.imagined_outcomes import divergence
 
 _CHUNK = 16
 
@@ -124,7 +124,7 @@ def answer(
     chosen: dict[CriticKind, Tensor] = {"random": candidates.rows[:, :most]}
     if aip is not None:
         chosen["aip"] = tries_by_aip(known, candidates.rows, frozen, aip, most)
-    chosen["information"] = tries_by_information(known, candidates.rows, frozen, most)
+    chosen["information"] = tries_by_information(candidates.rows, frozen, most)
     for critic, made in chosen.items():
         latents = frozen.latents(made)
         for number in tries:
@@ -252,65 +252,42 @@ _INFORMATION_CHUNK = 32
 
 
 @torch.no_grad()
-def tries_by_information(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, most: int) -> Tensor:
+def tries_by_information(candidates: Tensor, frozen: FrozenAap, most: int) -> Tensor:
     """The rows that an information-seeking chooser would try one after the other, [R, most]; a reference for AIP.
 
-    For each candidate AAP imagines both outcomes, reads them as if they had happened, and is asked how sure it would
-    then be of all candidates. It costs two readings of every candidate and c^2 scores a step. Not in the paper (compare
-    Lindley, 1956: the expected gain in Shannon information).
+    For each candidate AAP imagines both outcomes, reads them as if they had happened, and is asked how far its beliefs
+    in all candidates would then have moved (see `shared.policies.imagined_outcomes`). It costs two readings of every
+    candidate and c^2 scores a step. Not in the paper.
 
     Args:
-        known: of the interactions.
         candidates: rows to choose from, [R, c].
         frozen: the AAP, by whose beliefs they are chosen.
         most: how many interactions.
     """
     starts = range(0, len(candidates), _INFORMATION_CHUNK)
-    return torch.cat([_choose(known, candidates[start : start + _INFORMATION_CHUNK], frozen, most) for start in starts])
+    return torch.cat([_choose(candidates[start : start + _INFORMATION_CHUNK], frozen, most) for start in starts])
 
 
-def _choose(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, most: int) -> Tensor:
-    imagined = [_imagined(known, candidates, frozen, success) for success in (False, True)]
+def _choose(candidates: Tensor, frozen: FrozenAap, most: int) -> Tensor:
+    imagined = [frozen.imagined(candidates, success) for success in (False, True)]
     free = torch.ones(candidates.shape, dtype=torch.bool)
     made = candidates[:, :0]
     for _ in range(most):
-        expected = _unsureness_after(known, candidates, frozen, made, imagined)
-        best = torch.where(free, expected, torch.inf).argmin(dim=1, keepdim=True)
+        expected = _expected_divergence(candidates, frozen, made, imagined)
+        best = torch.where(free, expected, -torch.inf).argmax(dim=1, keepdim=True)
         free.scatter_(1, best, False)
         made = torch.cat([made, candidates.gather(1, best)], dim=1)
     return made
 
 
-def _imagined(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, success: bool) -> tuple[Tensor, Tensor]:
-    """Codes and weights of the candidates had they succeeded, or failed, each with the usual motion of such a one.
-
-    What else an outcome tells (see `shared.networks.actions.outcome_details`) is unknown.
-    """
-    rows = known.dataset.rows
-    alike = rows.motion[(rows.success > 0) == success]
-    motion = alike.median() if len(alike) else rows.motion.new_tensor(0.0)
-    found = (frozen.features[candidates], rows.xyz[candidates], rows.frame[candidates])
-    motions = motion.expand(candidates.shape)
-    return frozen.aap.interaction_codes(*found, motions, torch.full_like(motions, float(success)))
-
-
-def _unsureness_after(
-    known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, made: Tensor, imagined: list[tuple[Tensor, Tensor]]
+def _expected_divergence(
+    candidates: Tensor, frozen: FrozenAap, made: Tensor, imagined: list[tuple[Tensor, Tensor]]
 ) -> Tensor:
-    """Expected entropy, nats, of what AAP says of all candidates after each of them was tried as well, [R, c]."""
-    rows, aap, count = known.dataset.rows, frozen.aap, candidates.shape[1]
-    asked = (frozen.features[candidates], rows.xyz[candidates], rows.frame[candidates])
-    believed = torch.sigmoid(aap.action_logits(*asked, frozen.latents(made)[:, -1:]))
+    """How far beliefs in all candidates are expected to move, nats, after each of them was tried as well, [R, c]."""
+    believed = torch.sigmoid(frozen.logits(candidates, frozen.latents(made)[:, -1:]))
     expected = torch.zeros_like(believed)
     for odds, (codes, weights) in zip((1.0 - believed, believed), imagined, strict=True):
-        before = frozen.codes[made][:, None].expand(-1, count, -1, -1)
-        before_weights = frozen.weights[made][:, None].expand(-1, count, -1)
-        latents = aap.prefix_latents(
-            torch.cat([before, codes[:, :, None]], dim=2), torch.cat([before_weights, weights[..., None]], dim=2)
-        )[:, :, -1:]
         # One more axis, so that every candidate is asked about after every candidate.
-        features, xyz, frames = (x[:, None] for x in asked)
-        logits = aap.action_logits(features, xyz, frames, latents)
-        entropy = functional.softplus(logits) - torch.sigmoid(logits) * logits
-        expected += odds * entropy.mean(dim=-1)
+        after = frozen.logits(candidates[:, None], frozen.latents_with(made, codes, weights)[:, :, None])
+        expected += odds * divergence(torch.sigmoid(after), believed[:, None]).mean(dim=-1)
     return expected

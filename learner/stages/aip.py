@@ -21,6 +21,7 @@ from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_losses, information_gains, information_loss, mean_information_loss
 from shared.networks.aip import Aip
+from shared.policies.imagined_outcomes import divergence
 
 VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 21
@@ -30,15 +31,17 @@ _CHUNK = 4
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Targets of the AIP critic, and what it is told.
+    """Targets of the AIP critic, and what it is told: of C interactions that may come next after each context.
 
     Attributes:
-        gains: drop of the AAP loss by each interaction, [B, K].
-        latents: z before each interaction, [B, K, latent_width].
-        scores: s^AAP_u|z of each interaction before it, [B, K].
-        mask: interactions that have a target, [B, K].
+        candidates: rows, [B, K, C].
+        gains: what each is worth, nats, [B, K, C].
+        latents: z of the contexts, [B, K, latent_width].
+        scores: s^AAP_u|z of each, [B, K, C].
+        mask: which count, [B, K, C].
     """
 
+    candidates: Tensor
     gains: Tensor
     latents: Tensor
     scores: Tensor
@@ -51,6 +54,10 @@ class AipStage:
     The drop of the AAP loss is measured on rows of the same rollout that are no context at all, the same for every
     prefix, so that two losses differ by one interaction alone. Privileged: with a teacher, the loss is against what the
     oracle expects instead of single successes, which are ten coins a rollout that would drown the drop.
+
+    With `config.target` "beliefs" no outcome is asked at all: an interaction is worth how far AAP expects its beliefs
+    in these rows to move, by both outcomes that it may have. That depends on nothing that AIP cannot know, so it is
+    learned with far less noise.
     """
 
     name = "aip"
@@ -117,21 +124,48 @@ class AipStage:
 
     @torch.no_grad()
     def gains(self, ordered: OrderedRows) -> Gains:
-        """How much each interaction lowers the AAP loss on the rows outside of the context."""
-        frozen, rows = self.frozen, self.dataset.rows
+        """What interactions are worth after each context, by the rows outside of all contexts."""
         context = ordered.longest_context(self.config.context)
-        tries = ordered.rows[:, :context]
-        latents = frozen.latents(tries)
-        features = frozen.features[ordered.rows][:, None]
-        xyz, frames = rows.xyz[ordered.rows][:, None], rows.frame[ordered.rows][:, None]
-        logits = frozen.aap.action_logits(features, xyz, frames, latents[:, :, None])
-        held_out = ordered.asked(context)[:, -1]
+        latents = self.frozen.latents(ordered.rows[:, :context])
+        asked = ordered.asked(context)[:, -1]
+        gains = self._happened if self.config.target == "loss" else self._expected
+        return gains(ordered, latents, asked)
+
+    def _happened(self, ordered: OrderedRows, latents: Tensor, asked: Tensor) -> Gains:
+        """How much the interaction that came next lowered the AAP loss on the rows that are asked about."""
+        context = latents.shape[1] - 1
+        logits = self.frozen.logits(ordered.rows[:, None], latents[:, :, None])
         losses = action_scoring_losses(logits, self._answers[ordered.rows][:, None])
-        counts = held_out[:, None].to(losses.dtype)
+        counts = asked[:, None].to(losses.dtype)
         per_prefix = (losses * counts).sum(dim=-1) / counts.sum(dim=-1).clamp_min(1.0)
         own = torch.arange(context)
-        mask = ordered.valid[:, :context] & held_out.any(dim=1)[:, None]
-        return Gains(information_gains(per_prefix), latents[:, :-1], torch.sigmoid(logits[:, own, own]), mask)
+        mask = ordered.valid[:, :context] & asked.any(dim=1)[:, None]
+        return Gains(
+            ordered.rows[:, :context, None],
+            information_gains(per_prefix)[..., None],
+            latents[:, :-1],
+            torch.sigmoid(logits[:, own, own])[..., None],
+            mask[..., None],
+        )
+
+    def _expected(self, ordered: OrderedRows, latents: Tensor, asked: Tensor) -> Gains:
+        """How far each interaction that may come next is expected to move AAP's beliefs in what is asked about."""
+        rows, context, frozen = ordered.rows, latents.shape[1] - 1, self.frozen
+        imagined = [frozen.imagined(rows, success) for success in (False, True)]
+        # A candidate is not asked about itself.
+        others = (asked[:, None] & ~torch.eye(rows.shape[1], dtype=torch.bool)).to(latents.dtype)
+        gains, scores = [], []
+        for k in range(context):
+            believed = torch.sigmoid(frozen.logits(rows, latents[:, k, None]))
+            moved = torch.zeros_like(others)
+            for odds, (codes, weights) in zip((1.0 - believed, believed), imagined, strict=True):
+                after = frozen.logits(rows[:, None], frozen.latents_with(rows[:, :k], codes, weights)[:, :, None])
+                moved += odds[..., None] * divergence(torch.sigmoid(after), believed[:, None])
+            gains.append((moved * others).sum(dim=-1) / others.sum(dim=-1).clamp_min(1.0))
+            scores.append(believed)
+        mask = ordered.asked(context)[:, :-1] & (others > 0).any(dim=-1)[:, None]
+        candidates = rows[:, None].expand(-1, context, -1)
+        return Gains(candidates, torch.stack(gains, dim=1), latents[:, :-1], torch.stack(scores, dim=1), mask)
 
     def _order(self, rollouts: list[int], rng: np.random.Generator) -> OrderedRows:
         repeated = [number for number in rollouts for _ in range(self.config.draws)]
@@ -141,16 +175,17 @@ class AipStage:
         return (mean_information_loss if self._inherits else information_loss)(predicted, gains, mask)
 
     def _predict(self, ordered: OrderedRows, found: Gains) -> Tensor:
-        """AIP scores of the interactions of the context, [B, K]."""
-        rows, tries = self.dataset.rows, ordered.rows[:, : found.gains.shape[1]]
+        """AIP scores of the candidates, [B, K, C]."""
+        data, candidates = self.dataset.rows, found.candidates
         if self._inherits:
-            features = self.frozen.features[tries]
+            features = self.frozen.features[candidates]
         else:
             encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
-            cloud = ordered.cloud[:, : tries.shape[1]]
-            flat = self.aip.encoder.at(encoded, cloud.flatten(), rows.point[tries].flatten())
-            features = flat.reshape(*tries.shape, -1)
-        return self.aip.action_scores(features, rows.xyz[tries], rows.frame[tries], found.latents, found.scores)
+            places = torch.searchsorted(ordered.clouds, data.cloud[candidates])
+            flat = self.aip.encoder.at(encoded, places.flatten(), data.point[candidates].flatten())
+            features = flat.reshape(*candidates.shape, -1)
+        told = (data.xyz[candidates], data.frame[candidates])
+        return self.aip.action_scores(features, *told, found.latents[:, :, None], found.scores)
 
 
 def train_aip(recipe: StageTrainer) -> TrainingResult:

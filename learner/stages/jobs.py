@@ -15,6 +15,7 @@ OUT/ of a stage
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
@@ -42,7 +43,7 @@ from learner.stages.trainers import (
     training_of,
 )
 from learner.training import data_parallel
-from learner.training.checkpoint import check_fingerprint, read_cursor
+from learner.training.checkpoint import check_fingerprint, read_cursor, refuse_foreign
 from learner.training.hardware import Hardware, hardware
 from learner.training.loop import CHECKPOINT_FILE, TrainingResult
 from shared.errors import UsageError
@@ -68,6 +69,10 @@ LOCK_FILE = ".lock-learner"
 MAX_DONE_BYTES = 16 << 20
 """done.json names every object that was seen, in some 70 bytes each."""
 CHECKPOINT_FOLDERS = ("", ORACLE_FOLDER, AFFORDANCE_FOLDER)
+STAGE_LEAVES = "|".join(
+    map(re.escape, (CONFIG_FILE, DONE_FILE, METRICS_FILE, CHECKPOINT_FILE, *CHECKPOINT_FOLDERS[1:]))
+)
+"""Names in a stage's folder; one of them is there as soon as it trains."""
 
 StageName = ModuleName
 """A stage is called by the module that it trains."""
@@ -168,6 +173,7 @@ def run_stage(
     policy = _initial_policy(job, store, config)
     oracle = _oracle_of(job)
     fingerprint = _fingerprint(job, config, store, policy, oracle)
+    refuse_foreign(job.out, STAGE_LEAVES)
     done = (job.out / DONE_FILE).exists()
     # Nobody may make the folder of a finished stage before everybody has looked.
     data_parallel.wait_for_all()
@@ -304,7 +310,7 @@ def read_policy_folder(folder: Path) -> Policy:
         StoreError: it is damaged.
     """
     if not (folder / POLICY_FILE).is_file():
-        raise UsageError(f"{folder}: holds no {POLICY_FILE}; name the --out of a finished stage")
+        raise UsageError(f"{folder}: holds no {POLICY_FILE}; name the --out of a finished stage, or a bundled policy")
     limits = {POLICY_FILE: MAX_POLICY_JSON_BYTES, WEIGHTS_FILE: MAX_WEIGHTS_BYTES}
     return Policy.from_files({name: read_bounded(folder / name, limit) for name, limit in limits.items()})
 

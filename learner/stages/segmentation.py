@@ -1,6 +1,7 @@
 """The segmentation network, trained on labelled scenes (`adaafford objects scenes`)."""
 
 import hashlib
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,19 +10,23 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from learner.settings import SegmentationConfig
-from learner.training.loop import ParameterGroup, StepResult, TrainingResult, train
+from learner.settings import METRICS_FILE, SegmentationConfig
+from learner.training.checkpoint import refuse_foreign
+from learner.training.loop import CHECKPOINT_FILE, ParameterGroup, StepResult, TrainingResult, train
+from learner.training.trackers import EVENTS_FOLDER
 from shared import seeds
 from shared.errors import UsageError
 from shared.io.files import make_folder, write_atomically
 from shared.networks.pointnet2 import CloudBatch, group_cloud
 from shared.networks.segmentation import SEGMENTATION_NETWORK, SegmentationNetwork
 from shared.segmentation.scenes import MOVABLE, Kind, Scene, read_scene, read_scenes_document, scene_path
-from shared.segmentation.segmenter import Segmenter, begun
+from shared.segmentation.segmenter import SEGMENTATION_FILE, Segmenter, begun
 
 VALIDATION_SHARE = 8
 """One object in so many is used for validation."""
 VALIDATION_SCENES = 48
+LEAVES = "|".join(map(re.escape, (METRICS_FILE, CHECKPOINT_FILE, EVENTS_FOLDER, SEGMENTATION_FILE)))
+"""Names in the folder of a training; one of them is there as soon as it trains."""
 OFFSET_WEIGHT = 4.0
 """Of the mean error of the offsets, m, beside the cross entropy."""
 KIND_WEIGHTS = (0.5, 1.0, 1.5, 1.5)
@@ -129,6 +134,7 @@ def train_segmentation(
         UsageError: there are no scenes, or too few objects to hold one out; or `out` is of another training.
         StoreError: a scene is damaged.
     """
+    refuse_foreign(out, LEAVES)
     document = read_scenes_document(folder)
     objects = len(document.objects)
     held_out = seeds.generator(seed, "segmentation/validation").permutation(objects)[: -(-objects // VALIDATION_SHARE)]

@@ -3,6 +3,7 @@
 One file, put in place by a rename, so that no kill can leave weights of one step beside a cursor of another.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from shared.config import StrictModel
 from shared.errors import StoreError, UsageError
 from shared.io.documents import problem_of
 from shared.io.files import read_bounded, write_atomically
+from shared.io.text import plain
 from shared.policies.policy import MAX_WEIGHTS_BYTES, METADATA, read_tensors, tensor_header
 
 MAX_CHECKPOINT_BYTES = 4 * MAX_WEIGHTS_BYTES
@@ -41,6 +43,23 @@ class Cursor(StrictModel):
     best_metrics: dict[str, float] = Field(default_factory=dict)
 
     model_config = StrictModel.model_config | {"allow_inf_nan": True, "ser_json_inf_nan": "constants"}
+
+
+def refuse_foreign(out: Path, ours: str) -> None:
+    """Refuse a folder with files of which none is of a training.
+
+    Args:
+        out: the folder, which need not be there.
+        ours: a pattern of the names, of which a training that was begun has left one or more.
+
+    Raises:
+        UsageError: it is such a folder.
+    """
+    names = sorted(path.name for path in out.iterdir() if not path.name.startswith(".")) if out.is_dir() else []
+    if names and not any(re.fullmatch(ours, name) for name in names):
+        raise UsageError(
+            f"{out}: holds '{plain(names[0], 80)}' and no training; name a new or an empty folder as --out"
+        )
 
 
 def write_checkpoint(

@@ -18,6 +18,7 @@ import shutil
 import signal
 import socket
 import stat
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -72,7 +73,7 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results, and those above it; one that is there will do.
+    """Make a folder for results, and those above it; of one that is there, what killed writers left is removed.
 
     Raises:
         UsageError: something else has its name, or it cannot be made.
@@ -81,6 +82,24 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{path}: no folder can be made of this name ({error.strerror}); name another") from None
+    remove_remnants(path)
+
+
+@contextmanager
+def scratch_folder(purpose: str) -> Iterator[Path]:
+    """A folder of this user alone below TMPDIR for as long as the context; what killed processes left is removed first.
+
+    Args:
+        purpose: a part of its name.
+    """
+    place = Path(tempfile.gettempdir())
+    remove_remnants(place)
+    folder = place / temporary_name(f"adaafford-{purpose}")
+    folder.mkdir(0o700)
+    try:
+        yield folder
+    finally:
+        remove_tree(folder)
 
 
 @contextmanager

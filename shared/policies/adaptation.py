@@ -364,8 +364,8 @@ def dense_in_view(observation: Observation) -> Float32:
     """
     if observation.dense is None:
         raise UsageError(
-            "the policy is told what lies between the fingers, and the observation keeps no depth image; collect with "
-            "--collection.camera.keep-depth"
+            "the policy is told what lies between the fingers, and the observation keeps no depth image; use a policy "
+            "without that input, such as the bundled pull-sparse, or collect with --collection.camera.keep-depth"
         )
     view = view_from_world(observation.world_from_camera).astype(np.float32)
     return observation.dense.points() @ view.T

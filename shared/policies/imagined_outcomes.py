@@ -35,6 +35,12 @@ SURE = 1e-4
 """Beliefs are kept this far from 0 and 1, so that one action of which AAP is sure does not outweigh all others."""
 
 
+def divergence(after: Tensor, now: Tensor) -> Tensor:
+    """Kullback-Leibler divergence, nats, of beliefs `after` an outcome from those of `now`, each in [0, 1], [...]."""
+    now, after = now.clamp(SURE, 1 - SURE), after.clamp(SURE, 1 - SURE)
+    return after * (after / now).log() + (1 - after) * ((1 - after) / (1 - now)).log()
+
+
 class AskedActions(NamedTuple):
     """Actions that AAP is asked about: indices of their points, [A], and their frames, [A, 6 or more]."""
 
@@ -119,9 +125,7 @@ class InformationGainProposer(_ImaginingProposer):
         return AskedActions(np.repeat(candidates.points, ASKED), frames)
 
     def _worth(self, now: Tensor, after: Tensor) -> Tensor:
-        now, after = now.clamp(SURE, 1 - SURE), after.clamp(SURE, 1 - SURE)
-        moved = after * (after / now).log() + (1 - after) * ((1 - after) / (1 - now)).log()
-        return moved.mean(dim=-1)
+        return divergence(after, now).mean(dim=-1)
 
 
 class InformationValueProposer(_ImaginingProposer):

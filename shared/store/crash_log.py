@@ -24,6 +24,7 @@ from pydantic import Field, ValidationError
 
 from shared.config import StrictModel
 from shared.errors import StoreError
+from shared.heartbeat import is_recent
 from shared.io.files import DAY_S, is_abandoned, is_gone, process_name, read_bounded
 from shared.io.private import private_folder
 
@@ -178,7 +179,7 @@ def workers_at_work(url: str, now: float) -> list[str]:
     return [
         name
         for name, heartbeat in heartbeats.items()
-        if not is_gone(name) and now - heartbeat.written < _WORKER_SILENT_S
+        if not is_gone(name) and is_recent(heartbeat.written, now, _WORKER_SILENT_S)
     ]
 
 

@@ -15,7 +15,7 @@ from pydantic import Field, ValidationError
 
 from shared.config import StrictModel
 from shared.errors import MissingError, StoreError, UsageError
-from shared.heartbeat import Heartbeat
+from shared.heartbeat import Heartbeat, is_recent
 from shared.io.files import is_gone, process_name
 from shared.store.backends.base import StorageBackend
 from shared.store.crash_log import workers_at_work
@@ -41,7 +41,7 @@ class Mark(StrictModel):
 
     def is_alive(self, now: float) -> bool:
         """Whether its process runs, as far as this machine can know."""
-        return not is_gone(self.process) and now - self.written < SILENT_S
+        return not is_gone(self.process) and is_recent(self.written, now, SILENT_S)
 
 
 @contextmanager

@@ -103,10 +103,33 @@ class Store:
         except OSError as error:
             raise StoreError(f"{where}: no store can be made here ({error.strerror}); name another folder") from None
         store = cls.open(where)
-        if store.setting != setting:
-            difference = difference_of(store.setting.as_document(), setting.as_document())
-            raise StoreError(f"{where} holds another setting: {difference}; give the same, or another folder")
+        store._check_setting(where, setting)
         return store
+
+    @classmethod
+    def check_free(cls, where: str | Path, setting: Setting | None) -> None:
+        """Refuse a place where `create` would refuse this setting; nothing is written.
+
+        Args:
+            where: as for `create`.
+            setting: of the store that is wanted; None: any.
+
+        Raises:
+            StoreError: a store of another setting is there, or files that are no store.
+            UsageError: the URL is not allowed.
+        """
+        backend = backend_of(where)
+        if backend.exists(STORE_FILE):
+            store = cls.open(where)
+            if setting is not None:
+                store._check_setting(where, setting)
+        else:
+            _refuse_foreign(backend)
+
+    def _check_setting(self, where: str | Path, setting: Setting) -> None:
+        if self.setting != setting:
+            difference = difference_of(self.setting.as_document(), setting.as_document())
+            raise StoreError(f"{where} holds another setting: {difference}; give the same, or another folder")
 
     @classmethod
     def open(cls, where: str | Path) -> "Store":

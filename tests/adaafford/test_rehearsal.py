@@ -13,7 +13,7 @@ from adaafford.histories import TriedOutcome, read_history
 from adaafford.pretrained import load_policy
 from adaafford.scans import read_scan
 from adaafford.sessions import Session, SessionFiles, Step
-from cluster.cli.library import simulated
+from cluster.cli.library import simulated, simulated_again
 from cluster.cli.main import run as adaafford
 from cluster.evaluation import rehearsal
 from cluster.evaluation.rehearsal import STATE, Executed, Setting, SimulatedRobot
@@ -40,9 +40,9 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def make_robot(objects: Path, tmp_path: Path) -> Callable[[], SimulatedRobot]:
     def make(**changes: object) -> SimulatedRobot:
-        environment = next(simulated(objects, TASK, seed=1))
+        environment, again = next(simulated_again(objects, TASK, seed=1))
         told = {"task": TASK, "object": environment.object.ref.id, "seed": 1, "number": 0, "noise": 1.0, "marked": True}
-        return SimulatedRobot(environment, Setting.model_validate(told | changes), tmp_path)
+        return SimulatedRobot(environment, again, Setting.model_validate(told | changes), tmp_path)
 
     return make
 
@@ -73,19 +73,20 @@ def test_an_answer_that_comes_again_is_executed_once(make_robot: Callable[..., S
     assert len(robot.executed) == 1
 
 
-def test_actions_are_the_same_whether_or_not_a_rehearsal_was_interrupted(
+def test_actions_and_outcomes_are_the_same_whether_or_not_a_rehearsal_was_interrupted(
     make_robot: Callable[..., SimulatedRobot], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    aimed = list[Action]()
+    aimed, used = list[Action](), list[SapienEnvironment]()
 
     def opened(environment: SapienEnvironment, action: Action) -> Outcome:
         aimed.append(action)
         lower, upper = environment.object.limits().T
         environment.restore(lower + (upper - lower) * len(aimed) / 40)
-        return Outcome(OutcomeKind.OK, 0.1, True)
+        used.append(environment)
+        return Outcome(OutcomeKind.OK, 0.1 * used.count(environment), True)  # What an engine keeps decides.
 
     monkeypatch.setattr(SapienEnvironment, "execute", opened)
-    step, points = a_step(make_robot(), 1), []
+    step, points, told = a_step(make_robot(), 1), [], []
     for interrupted in (False, True):
         for path in tmp_path.iterdir():
             path.unlink()
@@ -96,8 +97,26 @@ def test_actions_are_the_same_whether_or_not_a_rehearsal_was_interrupted(
             robot.execute(step.model_copy(update={"interaction": number, "point": tuple(point)}))
             robot = make_robot() if interrupted else robot
         points.append([tuple(action.point) for action in aimed])
+        told.append(robot.executed)
     assert points[0] == points[1]
+    assert told[0] == told[1]
     assert len(set(points[0])) > 2
+
+
+@pytest.mark.slow
+def test_simulated_outcomes_are_the_same_to_the_last_bit_after_an_interruption(
+    make_robot: Callable[..., SimulatedRobot], tmp_path: Path
+) -> None:
+    told = []
+    for interrupted in (False, True):
+        for path in tmp_path.iterdir():
+            path.unlink()
+        robot = make_robot()
+        for number in range(1, 4):
+            robot.execute(a_step(robot, number))
+            robot = make_robot() if interrupted else robot
+        told.append(robot.executed)
+    assert told[0] == told[1]
 
 
 def test_a_scene_is_scanned_raw_and_the_same_after_an_interruption(make_robot: Callable[..., SimulatedRobot]) -> None:
@@ -238,6 +257,7 @@ def test_lines_go_between_session_and_robot(
         (["--seed", "-1"], "not negative"),
         (["--goal", "0.5"], "needs --policy"),
         (["--policy", "push-faucet", "--goal", "-1"], "more than 0"),
+        (["--policy", "push-faucet"], "is for 'push-faucet', but --task is 'pull-closed-door'"),
         (["--repeat"], "give one"),
         (["--budget", "6"], "allowed are 7"),
         (["--task", "juggle"], "juggle"),
@@ -251,6 +271,21 @@ def test_bad_input_is_one_line(
     line = capsys.readouterr().err
     assert expected in line
     assert line.count("\n") == 1
+
+
+@pytest.mark.parametrize(("flags", "folder"), [([], "0001"), (["--rollouts", "2"], "0002")])
+def test_a_folder_of_another_session_is_refused(
+    flags: list[str], folder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = tmp_path / folder
+    taken.mkdir()
+    (taken / "history.json").write_text("{}")
+    place = tmp_path if flags else taken
+    assert adaafford(["rehearse", str(place), "--task", TASK, "--policy", TASK, *flags]) == 2
+    assert capsys.readouterr().err == (
+        f"adaafford: {taken}: has the history.json of another session; name another folder\n"
+    )
+    assert [path.name for path in taken.iterdir()] == ["history.json"]
 
 
 def test_a_bundled_policy_that_uses_the_surface_between_the_fingers_acts_on_a_simulated_object(objects: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from adaafford.histories import TriedOutcome
 from adaafford.scans import ScanFrame, checked_scan, observation_of, read_scan
 from adaafford.sessions import Session, SessionFiles, Step
-from cluster.cli.library import simulated
+from cluster.cli.library import simulated_again
 from cluster.cli.main import run as adaafford
 from cluster.evaluation.rehearsal import Setting as Rehearsal
 from cluster.evaluation.rehearsal import SimulatedRobot
@@ -288,9 +288,10 @@ def test_flags_of_an_arm_that_cannot_be_honoured(
 
 
 def test_a_rehearsed_arm_answers_unreachable(objects: Path, tmp_path: Path) -> None:
-    environment = next(simulated(objects, "pull-closed-door", seed=1, arm="panda"))
+    environment, again = next(simulated_again(objects, "pull-closed-door", seed=1, arm="panda"))
     told = {"task": "pull-closed-door", "object": environment.object.ref.id, "seed": 1, "number": 0, "noise": 0.0}
-    robot = SimulatedRobot(environment, Rehearsal.model_validate(told | {"marked": True, "arm": "panda"}), tmp_path)
+    setting = Rehearsal.model_validate(told | {"marked": True, "arm": "panda"})
+    robot = SimulatedRobot(environment, again, setting, tmp_path)
     assert robot.base is not None and robot.base[:3] == (0.0, 0.0, 0.0)
     seen = read_scan(tmp_path / robot.request.cloud)
     assert seen.movable is not None

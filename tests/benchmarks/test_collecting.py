@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -57,8 +58,8 @@ def test_a_fidelity_agrees_with_itself(objects: Path) -> None:
     camera = CameraConfig(image_size=128, points=256, candidates=1000)
     for task, applies_to in (("push", refs), ("push-faucet", faucets)):
         plan = Plan(setting=Setting(task=task, seed=3, objects=applies_to, collection=CollectionConfig(camera=camera)))
-        result = compare(plan, objects, COARSE, COARSE, 12, lambda: None)
-        assert result.trials == 12
+        (result,) = compare(plan, objects, COARSE, [COARSE], 12, lambda: None)
+        assert result.trials == result.stands_for == 12
         assert result.label_agreement == result.kind_agreement == result.positive_f1 == 1.0
         assert result.confusions == ()
         assert not result.motion_error_median > 0
@@ -81,6 +82,35 @@ def test_f1_and_agreement_count_what_they_say() -> None:
     assert summarise([pair(True, False)]).positive_f1 == 0.0
 
 
+def test_what_moves_nothing_is_executed_in_the_reference_in_part_and_counts_for_the_rest(objects: Path) -> None:
+    refs = tuple(entry.ref for entry in scan(objects).usable)
+    camera = CameraConfig(image_size=128, points=256, candidates=1000)
+    plan = Plan(setting=Setting(task="push", seed=3, objects=refs, collection=CollectionConfig(camera=camera)))
+    advanced: list[None] = []
+    candidates = [COARSE, COARSE.model_copy(update={"version": 2})]
+    every = compare(plan, objects, COARSE, candidates, 24, lambda: None)
+    share = compare(plan, objects, COARSE, candidates, 24, lambda: advanced.append(None), quiet_share=0.25)
+    assert len(advanced) == 24
+    assert every[0].trials == every[1].trials == 24
+    assert share[0].trials == share[1].trials < 24
+    # All that moves anything is there, and each other one counts for four.
+    assert share[0].positives == every[0].positives > 0
+    assert share[0].stands_for == pytest.approx(share[0].positives + 4 * (share[0].trials - share[0].positives), abs=9)
+    assert share[0].positive_f1 == share[0].label_agreement == 1.0
+    assert share[0].positive_f1_low == share[0].positive_f1_high == 1.0
+
+
+def test_a_trial_counts_as_often_as_its_weight_says() -> None:
+    pairs = [pair(True, True, (0.5, 0.5)), pair(True, False, (0.02, 0.0)), replace(pair(False, False), weight=8.0)]
+    result = summarise(pairs)
+    assert (result.trials, result.stands_for, result.positives) == (3, 10.0, 2)
+    assert result.label_agreement == pytest.approx(0.9)
+    assert result.positive_f1 == pytest.approx(2 / 3)
+    nothing = summarise([])
+    assert nothing.trials == 0
+    assert np.isnan(nothing.label_agreement)
+
+
 def test_only_pairs_that_ever_succeed_can_depend_on_the_draw() -> None:
     tried = {0: (True, True), 1: (True, False), 2: (False, False), 3: (True,)}
     trials = [
@@ -101,8 +131,15 @@ def test_fidelity_prints_its_figures(capsys: pytest.CaptureFixture[str], objects
     found = bench(capsys, "fidelity", "--objects", str(objects), "--trials", "3", *COARSE_FLAGS)
     expected = "label_agreement positive_f1 trials positives motion_error_median reference_ms fast_ms"
     expected += " near_threshold near_threshold_other_labels clear_label_agreement clear_positive_f1"
+    expected += " positive_f1_low positive_f1_high stands_for candidate_steps drawn quiet_share"
     assert set(expected.split()) <= found.keys()
     assert found["trials"] == 3
+    flags = ["--trials", "3", "--versions", "1", "3", "--quiet-share", "0.5"]
+    found = bench(capsys, "fidelity", "--objects", str(objects), *flags, *COARSE_FLAGS)
+    by_version = found["by_version"]
+    assert isinstance(by_version, dict)
+    assert list(by_version) == ["1", "3"]
+    assert by_version["3"].items() <= found.items()
 
 
 def test_dynamics_prints_its_figures(capsys: pytest.CaptureFixture[str], objects: Path) -> None:
@@ -151,6 +188,7 @@ def test_no_shipped_package_finds_the_scripts() -> None:
         ([], "given nothing"),
         (["fidelity", "--task", "pusk"], "unknown task 'pusk'; allowed: push"),
         (["fidelity", "--trials", "0"], "trials"),
+        (["fidelity", "--quiet-share", "0"], "quiet_share"),
         (["dynamics", "--draws", "1"], "draws"),
         (["collect", "--objects", "/nowhere/at/all"], "/nowhere/at/all: no such folder"),
     ],

@@ -2,14 +2,17 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from cluster.cli.main import COMMANDS, run
+from cluster.cli.main import COMMANDS, guarded, only_prints, run
+from shared.store import Store
 from shared.tasks import TEST_CATEGORIES
+from tests.support.fabricate import fabricate_setting
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *args: str) -> str:
@@ -84,14 +87,44 @@ def test_an_unknown_preset_lists_those_there_are(capsys: pytest.CaptureFixture[s
     assert "unknown preset 'huge'; allowed: laptop, paper, smoke" in line
 
 
+def test_a_place_with_other_things_is_refused_before_objects_are_made(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.tex").write_text("x")
+    Store.create(tmp_path / "store", fabricate_setting())
+    for name, said in (("foreign", "is not empty and no store"), ("store", "holds another setting")):
+        assert said in complaint(capsys, "collect", "--store", str(tmp_path / name), "--workers", "0")
+        assert not (tmp_path / f"{name}-objects").exists()
+
+
+def test_a_picture_of_another_kind_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for action in ("preview", "film"):
+        out = tmp_path / "sheet.xyz"
+        assert f"{out}: not a kind of picture" in complaint(capsys, "objects", action, str(tmp_path), str(out))
+        assert not out.exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_says_how_to_go_on(number: signal.Signals) -> None:
+    script = (
+        "import signal, sys; from cluster.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
+        f"main.run = lambda args: main.guarded(lambda: signal.raise_signal({int(number)}), args)\n"
+        "sys.argv[1:] = ['collect', '--store', 'my store']\n"
+        "main.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 128 + number
+    assert done.stderr == (
+        "adaafford: interrupted; committed data stay, and the same command continues: "
+        "adaafford collect --store 'my store'\n"
+    )
+
+
 @pytest.mark.parametrize("args", [["--rollouts", "x"], ["--rolouts", "3"], ["--rollouts", "0"]])
 def test_bad_flags_end_with_code_2(args: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    try:
-        code = run(["collect", "--store", str(tmp_path / "store"), *args])
-    except SystemExit as stop:
-        code = int(stop.code or 0)
-    assert code == 2
-    assert "roll" in capsys.readouterr().err
+    assert "roll" in complaint(capsys, "collect", "--store", str(tmp_path / "store"), *args)
 
 
 def test_aip_needs_a_policy(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -161,3 +194,40 @@ def test_threads_that_wait_for_each_other_do_not_keep_a_busy_processor_for_long(
         done = subprocess.run([sys.executable, "-c", code], env=told, capture_output=True, text=True, check=True)
         assert done.stdout == f"{spins}\n"
     assert "GOMP_SPINCOUNT = '30000'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("args", "continues"),
+    [
+        (["train", "aap", "--out", "RUN"], True),
+        (["objects", "scenes", "OBJECTS", "SCENES"], True),
+        (["store", "export", "STORE", "--out", "DATA"], True),
+        (["objects", "check", "OBJECTS"], False),
+        (["store", "verify", "STORE"], False),
+    ],
+)
+def test_an_interrupt_is_one_line_that_says_whether_the_same_command_continues(
+    args: list[str], continues: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt() -> int:
+        raise KeyboardInterrupt
+
+    assert guarded(interrupt, args) == 130
+    hint = f"; committed data stay, and the same command continues: adaafford {' '.join(args)}"
+    assert capsys.readouterr().err == f"adaafford: interrupted{hint if continues else ''}\n"
+    assert only_prints(args) is not continues
+
+
+@pytest.mark.parametrize(("moment", "code"), [("main._interrupted", 130), ("main.Streams.settle", -signal.SIGINT)])
+def test_a_second_interrupt_after_a_command_ended_prints_no_traceback(moment: str, code: int) -> None:
+    script = (
+        "import signal; from cluster.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "def interrupt(*_): signal.raise_signal(signal.SIGINT)\n"
+        "main.run = lambda args: main.guarded(interrupt, ['run'])\n"
+        f"{moment} = interrupt\n"
+        "main.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr

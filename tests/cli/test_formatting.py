@@ -6,7 +6,7 @@ import math
 
 from rich.console import Console
 
-from shared.formatting import csv_table, finite, markdown_table, number, percent, terminal_table
+from shared.formatting import counted, csv_table, finite, markdown_table, number, percent, terminal_table
 
 
 def test_what_is_no_figure_is_a_dash() -> None:
@@ -14,6 +14,11 @@ def test_what_is_no_figure_is_a_dash() -> None:
     assert [number(3), number(0.25), percent(0.7654)] == ["3", "0.250", "76.5"]
     assert percent(0.5, (0.25, 0.75), decimals=0) == "50.0 [25, 75]"
     assert percent(0.5, (0.25, math.nan)) == "50.0"
+
+
+def test_one_thing_is_counted_in_the_singular() -> None:
+    assert [counted(n, "shard") for n in (0, 1, 2)] == ["0 shards", "1 shard", "2 shards"]
+    assert [counted(n, "category", "categories") for n in (1, 2)] == ["1 category", "2 categories"]
 
 
 def test_finite_reaches_every_number_of_nested_values() -> None:

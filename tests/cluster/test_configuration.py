@@ -67,10 +67,60 @@ def test_lists_are_divided_by_commas_or_spaces(budgets: list[str]) -> None:
     ("flags", "expected"), [(["--budgets", "1,x"], "'x'"), (["--sides", "left,up"], "invalid choice 'up'")]
 )
 def test_a_wrong_word_in_a_list_is_named(flags: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
+    with pytest.raises(UsageError) as refused:
         parse_flags(Evaluation, flags, "evaluate", Evaluation())
-    assert stop.value.code == 2
-    assert expected in capsys.readouterr().err
+    assert expected in str(refused.value)
+    assert capsys.readouterr().err == ""
+
+
+ADAPT, COLLECT = ["--cloud", "a.ply", "--history", "h.json"], ["--store", "s"]
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["adapt", *ADAPT, "--polcy", "x"], "unknown --polcy; did you mean --policy?"),
+        (["adapt", "--polcy", "x"], "unknown --polcy; did you mean --policy?"),
+        (["adapt", "--cloud", "a.ply"], "missing: --history PATH"),
+        (["adapt", "--cloud"], "Missing value for argument '--cloud'"),
+        (
+            ["adapt", *ADAPT, "--intrinsics", "1", "2", "3"],
+            "--intrinsics: given 1 2 3; allowed: FLOAT FLOAT FLOAT FLOAT",
+        ),
+        (["adapt", *ADAPT, "--outcome", "moved"], "--outcome: given moved; allowed: FLOAT"),
+        (["adapt", *ADAPT, "--kind", "moved"], "--kind: given 'moved'; allowed: ok, no-contact, "),
+        (["collect", *COLLECT, "--workers", "1.5"], "--workers: given '1.5'; allowed: a whole number"),
+        (["collect", *COLLECT, "--collection.camera.distance", "far"], "given 'far'; allowed: a number"),
+        (
+            ["collect", *COLLECT, "--collection.dynamics", "part_mass=2:1"],
+            "--collection.dynamics: part_mass=2:1: setting 'dynamics.part_mass': needs low <= high, and low > 0 where "
+            "log is set; given 2.0 to 1.0;",
+        ),
+        (
+            ["collect", *COLLECT, "--collection.camera.points", "0"],
+            "--collection.camera.points: Input should be greater than or equal to 64; given 0;",
+        ),
+        (
+            ["collect", *COLLECT, "--collection.camera.points", "400", "--collection.camera.candidates", "100"],
+            "--collection.camera: candidates (100) must be at least points (400);",
+        ),
+        (["collect", *COLLECT, "extra"], "unknown extra;"),
+        (
+            ["train", "prior", *COLLECT, "--out", "o", "--prior.steps", "-1"],
+            "--prior.steps: Input should be greater than or equal to 1; given -1;",
+        ),
+        (
+            ["objects", "import", "s", "--out", "o", "--front", "+q"],
+            "--front: given '+q'; allowed: +x, -x, +y, -y, +z, -z;",
+        ),
+    ],
+)
+def test_wrong_flags_are_one_line(args: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(args) == 2
+    line = capsys.readouterr().err
+    assert said in line
+    assert line.endswith("--help` says more\n")
+    assert line.count("\n") == 1
 
 
 def test_an_unknown_method_is_named_before_a_run_is_looked_for(capsys: pytest.CaptureFixture[str]) -> None:

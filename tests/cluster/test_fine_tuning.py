@@ -69,6 +69,12 @@ def test_the_policies_that_come_along_say_what_they_have_seen(tmp_path: Path) ->
     assert seen_by("pull-closed-door")
 
 
+@pytest.mark.parametrize("name", ["pull", "pull-closed-door", "push-faucet"])
+def test_a_policy_does_not_say_what_its_predecessor_has_seen(name: str) -> None:
+    assert seen_by(name)
+    assert not seen_by(name) & seen_by(f"{name}-sparse")
+
+
 def test_a_run_that_started_from_a_policy_is_not_evaluated_on_what_that_has_seen(
     source: RunFolder, tmp_path: Path
 ) -> None:

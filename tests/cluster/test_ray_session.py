@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -371,6 +372,59 @@ def test_a_session_that_does_not_come_up_at_first_is_started_again_and_leaves_no
         assert left[0].poll() is not None
         assert len(list(sessions.iterdir())) == 1
     assert "timed out during startup.); starting it again" in caplog.text
+    assert list(sessions.iterdir()) == []
+
+
+@pytest.mark.parametrize("step", ["ray.shutdown", "cluster.workers.session.remove_tree"])
+def test_a_signal_during_the_end_of_a_session_waits_until_nothing_is_left(
+    step: str, sessions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = []
+
+    def disturbed(*paths: Path) -> None:
+        signal.raise_signal(signal.SIGINT)
+        for path in paths:
+            shutil.rmtree(path)
+        done.append(step)
+
+    monkeypatch.setattr("ray.init", lambda **settings: None)
+    monkeypatch.setattr("ray.shutdown", lambda: None)
+    monkeypatch.setattr(step, disturbed)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), ray_session(1):
+            pass
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done == [step]
+    assert list(sessions.iterdir()) == []
+
+
+def test_a_session_may_end_in_a_thread_where_no_signals_are_handled() -> None:
+    done: list[bool] = []
+
+    def end() -> None:
+        with session._undisturbed():
+            done.append(True)
+
+    thread = threading.Thread(target=end)
+    thread.start()
+    thread.join()
+    assert done == [True]
+
+
+def test_an_interrupt_while_a_session_starts_leaves_no_process(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    left: list[subprocess.Popen[bytes]] = []
+
+    def interrupted(**settings: object) -> None:
+        left.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ray.init", interrupted)
+    with pytest.raises(KeyboardInterrupt), ray_session(1):
+        pass
+    assert left[0].poll() is not None
     assert list(sessions.iterdir()) == []
 
 

@@ -341,6 +341,43 @@ def test_the_command_shows_the_object_before_and_after(
     assert run([*line, "--replace"]) == 2
 
 
+def test_an_import_that_was_stopped_before_its_picture_goes_on(
+    cabinet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "objects"
+    line = ["objects", "import", str(cabinet), "--out", str(out), "--front", "+y"]
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("collector.viz.preview.contact_sheet", stop)
+        assert run(line) == 130
+    made = {path: path.stat().st_mtime_ns for path in (out / "cabinet").rglob("*")}
+    assert made and not (out / "cabinet.png").exists()
+    assert run(line) == 0
+    assert {path: path.stat().st_mtime_ns for path in (out / "cabinet").rglob("*")} == made
+    assert (out / "cabinet.png").exists()
+
+
+def test_a_replacement_that_was_stopped_goes_on(cabinet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "objects"
+    line = ["objects", "import", str(cabinet), "--out", str(out)]
+    assert run([*line, "--front", "+y"]) == 0
+    line += ["--front", "+x", "--replace"]
+
+    def stop_within(path: Path) -> None:
+        next(path.rglob("meta.json")).unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("collector.objects.importing.importer.remove_tree", stop_within)
+        assert run(line) == 130
+    assert run(line) == 0
+    assert [path.name for path in out.iterdir() if path.is_dir() and not path.name.startswith(".")] == ["cabinet"]
+    assert read_object(out / "cabinet")
+
+
 @pytest.mark.parametrize(
     ("flags", "reason"),
     [

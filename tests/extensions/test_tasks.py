@@ -44,6 +44,7 @@ def door(tmp_path: Path) -> Path:
         ('name = "open"\nprimitive = "push"\npart_names = [""]', "setting 'part_names.0': String should have"),
         ('name = "open"\nprimitive = "push"\ndirections = []', "setting 'directions': Tuple should have at least 1"),
         ('name = "open"\nprimitive = "push"\nedge_share = 2', "setting 'edge_share': Input should be less"),
+        ('name = "open"\nprimitive = "shove"', "unknown primitive 'shove'; allowed: push, push-left"),
         ("name = ", "not valid TOML"),
     ],
 )

@@ -21,7 +21,7 @@ from shared.errors import UsageError
 from shared.networks.actions import FRAME_WIDTH
 from shared.pinch import BINS, PROFILE_WIDTH
 from shared.plan import Plan
-from shared.policies.adaptation import Adapter
+from shared.policies.adaptation import Adapter, dense_in_view
 from shared.policies.policy import Policy
 from shared.policies.proposers import AipProposer, ExploitProposer
 from shared.store import Store
@@ -164,6 +164,12 @@ def test_a_campaign_keeps_the_depth_images_that_its_networks_need(tmp_path: Path
     large = {"learner": learner, "collection": {"camera": {"image_size": 4096}}}
     with pytest.raises(UsageError, match=r"collection\.camera.*keep_depth needs an image_size of at most"):
         with_needed_depth(CampaignConfig.model_validate(large))
+
+
+def test_a_cloud_without_depth_image_names_a_policy_that_needs_none() -> None:
+    observation = dataclasses.replace(fabricated_rollouts(fabricated_plan(), 1)[0].observations[0], dense=None)
+    with pytest.raises(UsageError, match="use a policy without that input, such as the bundled pull-sparse"):
+        dense_in_view(observation)
 
 
 def test_flips_are_drawn_only_where_they_are_asked_for() -> None:

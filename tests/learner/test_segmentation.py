@@ -64,6 +64,8 @@ def test_what_cannot_be_learnt_from_is_refused(
 ) -> None:
     assert adaafford(["train", "segmentation", "--scenes", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "make scenes by `adaafford objects scenes`" in capsys.readouterr().err
+    assert adaafford(["train", "segmentation", "--scenes", str(scenes), "--out", str(scenes)]) == 2
+    assert f"{scenes}: holds '{scene_path(scenes, 0).name}' and no training" in capsys.readouterr().err
     scene_path(scenes, 1).write_bytes(b"damaged")
     assert adaafford(["train", "segmentation", "--scenes", str(scenes), "--out", str(tmp_path / "out")]) == 2
     assert "damaged or foreign" in capsys.readouterr().err

@@ -340,6 +340,28 @@ def test_the_command_says_what_it_needs(capsys: pytest.CaptureFixture[str]) -> N
     assert "--aap.imitation" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("command", [["train", "prior"], ["train", "alternate"], ["learn"]])
+def test_a_folder_with_other_files_is_refused(
+    command: list[str], store: Path, config_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "thesis.tex").write_text("x")
+    assert run([*command, "--store", str(store), "--out", str(tmp_path), "--config", str(config_file)]) == 2
+    assert capsys.readouterr().err == (
+        f"adaafford: {tmp_path}: holds 'thesis.tex' and no training; name a new or an empty folder as --out\n"
+    )
+    assert not [path.name for path in tmp_path.iterdir() if not path.name.startswith((".", "thesis"))]
+
+
+def test_a_training_starts_from_a_bundled_policy_by_name(
+    store: Path, config_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    where = ["--store", str(store), "--out", str(tmp_path / "out"), "--config", str(config_file)]
+    for name, said in (("pull", "a policy for 'pull', but the store is of"), ("./pull", "holds no policy.json")):
+        assert run(["train", "aap", *where, "--init", name]) == 2
+        assert said in capsys.readouterr().err
+
+
 def test_every_stage_learns_in_bf16(store: Path, tmp_path: Path) -> None:
     before: Path | None = None
     for stage in ("prior", "aap", "aip"):

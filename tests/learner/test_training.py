@@ -49,6 +49,7 @@ from shared.io.files import TEMPORARY_PREFIX
 from shared.networks.actions import outcome_details
 from shared.networks.network_config import NetworkConfig
 from shared.plan import InteractionRecord, RolloutRecord
+from shared.policies.imagined_outcomes import SURE
 from shared.policies.policy import WEIGHTS_FILE, Policy
 from shared.types import Role
 from tests.support.killed_writers import kill_while_writing
@@ -239,36 +240,36 @@ def test_aip_chooses_each_candidate_once_and_the_best_by_its_critic(coin_dataset
     assert torch.equal(again, made[:, :2])
 
 
-def test_tries_by_information_leave_aap_as_sure_as_it_expects_to_be(
-    coin_dataset: Dataset, aap_of_coins: Weights
-) -> None:
+def test_tries_by_information_move_beliefs_as_far_as_aap_expects(coin_dataset: Dataset, aap_of_coins: Weights) -> None:
     policy, known = after_aap(coin_dataset, aap_of_coins)
     frozen, aap, rows = FrozenAap.of(policy.aap, known), policy.aap, coin_dataset.rows
     candidates = Candidates.of(coin_dataset, EVERYTHING.validation, draws=1, seed=0).rows
-    made = tries_by_information(known, candidates, frozen, 3)
+    made = tries_by_information(candidates, frozen, 3)
     assert all(len(set(tries)) == 3 for tries in made.tolist())
     mine = candidates[0]
     asked = (frozen.features[mine], rows.xyz[mine], rows.frame[mine])
 
     def expected(row: int) -> float:
-        """How unsure AAP expects to be after one more try than the first."""
+        """How far AAP expects its beliefs to move by one more try than the first."""
         before, total = made[0, :1], 0.0
         place = int((mine == row).nonzero())
-        odds = torch.sigmoid(aap.action_logits(*asked, frozen.latents(before)[-1]))[place]
+        sure = (SURE, 1 - SURE)
+        now = torch.sigmoid(aap.action_logits(*asked, frozen.latents(before)[-1])).double().clamp(*sure)
+        odds = now[place]
         for success in (0.0, 1.0):
             motion = rows.motion[rows.success == success].median()
             told = (frozen.features[row], rows.xyz[row], rows.frame[row], motion, torch.tensor(success))
             code, weight = aap.interaction_codes(*(x[None] for x in told))
             z = aap.latent(torch.cat([frozen.codes[before], code]), torch.cat([frozen.weights[before], weight]))
-            scores = torch.sigmoid(aap.action_logits(*asked, z)).double()
-            entropy = (torch.special.entr(scores) + torch.special.entr(1 - scores)).mean()
-            total += float((odds if success else 1 - odds) * entropy)
+            scores = torch.sigmoid(aap.action_logits(*asked, z)).double().clamp(*sure)
+            moved = (scores * (scores / now).log() + (1 - scores) * ((1 - scores) / (1 - now)).log()).mean()
+            total += float((odds if success else 1 - odds) * moved)
         return total
 
     with torch.no_grad():
         # All coins of a rollout tell the same, so that the best may be a tie.
-        least = min(expected(row) for row in mine.tolist() if row != made[0, 0])
-        assert expected(int(made[0, 1])) == pytest.approx(least, rel=1e-3)
+        furthest = max(expected(row) for row in mine.tolist() if row != made[0, 0])
+        assert expected(int(made[0, 1])) == pytest.approx(furthest, rel=1e-3)
 
 
 def test_gains_are_differences_of_the_loss_on_the_same_rows(coin_dataset: Dataset) -> None:
@@ -281,9 +282,48 @@ def test_gains_are_differences_of_the_loss_on_the_same_rows(coin_dataset: Datase
         logits = predict(policy.aap, SeenRows.of(Batch.of(coin_dataset, ordered), policy.aap.encoder), 3).logits
     success = coin_dataset.rows.success[ordered.rows][:, None].expand_as(logits)
     losses = nn.functional.binary_cross_entropy_with_logits(logits, success, reduction="none")[..., 3:].mean(-1)
-    torch.testing.assert_close(found.gains, losses[:, :-1] - losses[:, 1:], rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(found.gains[..., 0], losses[:, :-1] - losses[:, 1:], rtol=1e-3, atol=1e-5)
     for k in range(3):
-        torch.testing.assert_close(found.scores[:, k], torch.sigmoid(logits[:, k, k]), rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(found.scores[:, k, 0], torch.sigmoid(logits[:, k, k]), rtol=1e-3, atol=1e-5)
+
+
+def test_expected_gains_are_mean_divergences_over_both_outcomes_of_what_was_not_tried(coin_dataset: Dataset) -> None:
+    policy, known = fresh(coin_dataset)
+    frozen, aap, rows = FrozenAap.of(policy.aap, known), policy.aap, coin_dataset.rows
+    stage = AipStage(policy.aip, coin_dataset, EVERYTHING, AipConfig(context=3, target="beliefs"), frozen)
+    ordered = order_rows(coin_dataset, [0, 1], 7, np.random.default_rng(0))
+    found = stage.gains(ordered)
+    motions = {sense: float(rows.motion[(rows.success > 0) == sense].median()) for sense in (False, True)}
+
+    def told(made: list[int], row: int, success: bool) -> torch.Tensor:
+        given = (frozen.features[[row]], rows.xyz[[row]], rows.frame[[row]])
+        outcome = torch.tensor([motions[success]]), torch.tensor([float(success)])
+        code, weight = aap.interaction_codes(*given, *outcome)
+        return aap.latent(torch.cat([frozen.codes[made], code]), torch.cat([frozen.weights[made], weight]))
+
+    def believed(row: int, z: torch.Tensor) -> torch.Tensor:
+        logits = aap.action_logits(frozen.features[[row]], rows.xyz[[row]], rows.frame[[row]], z)
+        return torch.sigmoid(logits[0]).double()
+
+    def worth(made: list[int], row: int, asked: list[int]) -> float:
+        z, total = aap.latent(frozen.codes[made], frozen.weights[made]), 0.0
+        odds = float(believed(row, z))
+        for success, chance in ((True, odds), (False, 1 - odds)):
+            after = told(made, row, success)
+            for other in asked:
+                p, q = believed(other, after), believed(other, z)
+                moved = p * (p / q).log() + (1 - p) * ((1 - p) / (1 - q)).log()
+                total += chance * float(moved) / len(asked)
+        return total
+
+    with torch.no_grad():
+        for place in range(2):
+            mine = ordered.rows[place].tolist()
+            for k in range(3):
+                assert found.mask[place, k].tolist() == [number >= k for number in range(7)]
+                for number in range(k, 7):
+                    expected = worth(mine[:k], mine[number], [row for row in mine[3:] if row != mine[number]])
+                    assert float(found.gains[place, k, number]) == pytest.approx(expected, abs=1e-5)
 
 
 def reached(stage: Stage, whole: nn.Module) -> set[str]:

@@ -14,7 +14,7 @@ import pytest
 
 from cluster.cli.main import run
 from collector.setting import in_fidelity_of
-from shared.config import CollectionConfig, Fidelity
+from shared.config import CollectionConfig, Fidelity, FidelityVersion
 from shared.errors import SchemaVersionError, StoreError
 from shared.io.documents import with_checksum
 from shared.plan import Job, Plan, RolloutStatus
@@ -143,14 +143,23 @@ def test_a_store_of_the_first_version_is_collected_into_trained_from_and_exporte
     assert run(["store", "export", str(where), "--out", str(tmp_path / "data")]) == 0
 
 
-def test_only_who_asks_for_the_default_fidelity_goes_on_with_that_of_a_store(tmp_path: Path) -> None:
-    default, first = CollectionConfig(), CollectionConfig(fidelity=Fidelity())
+@pytest.mark.parametrize("version", [1, 2])
+def test_only_who_asks_for_the_default_fidelity_goes_on_with_that_of_a_store(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, version: FidelityVersion
+) -> None:
+    default, first = CollectionConfig(), CollectionConfig(fidelity=Fidelity(version=version))
     older = SETTING.model_copy(update={"collection": first})
-    for name, setting in (("newer", SETTING), ("older", older)):
+    other = CollectionConfig(fidelity=Fidelity(version=3, solver_iterations=30))
+    for name, setting in (
+        ("newer", SETTING),
+        ("older", older),
+        ("other", older.model_copy(update={"collection": other})),
+    ):
         Store.create(tmp_path / name, setting)
-    other = CollectionConfig(fidelity=Fidelity(version=2, solver_iterations=30))
-    found = [in_fidelity_of(name, Store.begun_with(tmp_path / name), default) for name in ("newer", "older", "none")]
-    assert found == [default, first, default]
+    names = ("newer", "older", "other", "none")
+    found = [in_fidelity_of(name, Store.begun_with(tmp_path / name), default) for name in names]
+    assert found == [default, first, default, default]
+    assert caplog.messages == [f"older: was begun with fidelity version {version}; it goes on with that"]
     assert in_fidelity_of("older", Store.begun_with(tmp_path / "older"), other) == other
 
 

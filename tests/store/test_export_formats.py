@@ -23,6 +23,7 @@ from shared.errors import StoreError, UsageError
 from shared.io.files import exclusive_lock
 from shared.plan import InteractionRecord, Job, Plan, RolloutRecord
 from shared.store import Store, export
+from shared.store.maintenance import destinations
 from shared.store.maintenance.datacard import SplitFigures, size_category
 from shared.store.maintenance.formats import EXPORT_FORMATS, word
 from shared.store.maintenance.steps import Content, survey
@@ -327,6 +328,28 @@ def test_an_export_that_has_all_but_its_name_is_not_written_again(store: Store, 
     export(store, tmp_path / "out", SPLITS, lambda *counts: said.append(counts), format="hf")
     assert len(said) == len(store.parts()), "each shard was looked through, and none was written"
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_an_export_that_was_stopped_with_its_notes_in_it_goes_on(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    export(store, tmp_path / "whole", SPLITS, format="hf")
+    remove = destinations.remove_tree
+
+    def stop(path: Path) -> None:
+        if path == out / destinations.NOTES:
+            raise KeyboardInterrupt
+        remove(path)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(destinations, "remove_tree", stop)
+        export(store, out, SPLITS, format="hf")
+    assert (out / destinations.NOTES).is_dir()
+    with pytest.raises(UsageError, match="is there already"):
+        export(store, out, SPLITS, format="plain")
+    export(store, out, SPLITS, format="hf")
+    assert contents(out) == contents(tmp_path / "whole")
 
 
 def contents(out: Path) -> dict[str, bytes]:

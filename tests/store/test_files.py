@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -135,6 +136,31 @@ def test_what_the_dead_left_and_cannot_be_removed_stays(tmp_path: Path, monkeypa
         assert left.exists()
     files.remove_remnants(tmp_path)
     assert not left.exists()
+
+
+def test_a_scratch_folder_of_a_killed_process_goes_with_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = "import os, signal; from shared.io.files import scratch_folder\n"
+    code += "with scratch_folder('export') as folder:\n"
+    code += "    (folder / 'piece').write_bytes(b'x'); os.kill(os.getpid(), signal.SIGKILL)"
+    killed = subprocess.run([sys.executable, "-c", code], env={**os.environ, "TMPDIR": str(tmp_path)}, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert (left / "piece").exists()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with files.scratch_folder("export") as folder, files.scratch_folder("bench") as other:
+        assert sorted(tmp_path.iterdir()) == sorted([folder, other])
+        assert folder.stat().st_mode & 0o777 == 0o700
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_for_results_has_nothing_of_killed_writers(tmp_path: Path) -> None:
+    left = kill_while_writing(tmp_path / "a.json")
+    (tmp_path / "b.json").touch()
+    files.make_folder(tmp_path)
+    assert not left.exists()
+    assert (tmp_path / "b.json").exists()
 
 
 def test_removing_a_link_leaves_what_it_points_at(tmp_path: Path) -> None:

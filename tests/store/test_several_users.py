@@ -83,17 +83,19 @@ def test_no_driver_begins_beside_a_repair(s3_url: str) -> None:
     "mark",
     [
         Mark(process=ELSEWHERE, alone=True, written=time.time() - 2 * SILENT_S),
+        Mark(process=ELSEWHERE, alone=True, written=time.time() + 24 * 3600),
         Mark(process=f"{process_name().rsplit('~', 2)[0]}~4194303~1", alone=True, written=time.time()),
     ],
 )
-def test_a_holder_that_is_silent_or_dead_is_forgotten(mark: Mark, s3_url: str) -> None:
+def test_a_holder_that_is_silent_or_dead_or_had_a_wrong_clock_is_forgotten(mark: Mark, s3_url: str) -> None:
     place = make(s3_url).backend
     place.replace("status/driver-dead.json", mark.model_dump_json().encode())
     with place.only_one("driver", alone=True):
         assert "driver-dead.json" not in place.names("status")
 
 
-def test_a_bucket_is_not_repaired_while_a_worker_writes_a_shard(s3_url: str) -> None:
+@pytest.mark.parametrize("off_s", [-3600, 3600])
+def test_a_bucket_is_not_repaired_while_a_worker_writes_a_shard(s3_url: str, off_s: int) -> None:
     store = make(s3_url, 1)
     half = f"shards/{Job(PLAN.key, 1, 2).shard_id}/rollouts.parquet"
     store.backend.create(half, b"some rows")
@@ -102,7 +104,7 @@ def test_a_bucket_is_not_repaired_while_a_worker_writes_a_shard(s3_url: str) -> 
         repair(s3_url)
     assert store.backend.exists(half)
     store.crash_log.forget(process_name())
-    heartbeat = Heartbeat(shard_id="x", rollout=1, written=time.time() - 3600)
+    heartbeat = Heartbeat(shard_id="x", rollout=1, written=time.time() + off_s)
     store.backend.replace(f"underway/{ELSEWHERE}.json", heartbeat.model_dump_json().encode())
     assert repair(s3_url)[1].set_aside == (half.rpartition("/")[0],)
 

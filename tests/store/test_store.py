@@ -307,6 +307,17 @@ def test_another_setting_is_refused_with_the_difference(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
+def test_a_place_is_checked_as_a_store_is_made(tmp_path: Path) -> None:
+    Store.check_free(tmp_path / "new", None)
+    assert not (tmp_path / "new").exists()
+    Store.create(tmp_path / "made", SETTING)
+    Store.check_free(tmp_path / "made", SETTING)
+    with pytest.raises(StoreError, match="holds another setting: seed"):
+        Store.check_free(tmp_path / "made", SETTING.model_copy(update={"seed": SETTING.seed + 1}))
+    with pytest.raises(StoreError, match="is not empty and no store"):
+        Store.check_free(tmp_path, None)
+
+
 def test_folders_that_are_no_store_are_refused(tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_bytes(b"x")

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from cluster.collection.tally import Tally
 from collector.worker import Worker
 from shared.errors import UsageError
+from shared.io.files import scratch_folder
 from shared.plan import ROLLOUTS_PER_SHARD, Plan, missing_jobs
 from shared.progress import Advance
 from shared.store import Store, info
@@ -117,12 +117,12 @@ def speedup(plan: Plan, folder: Path, rollouts: int, repeats: int, workers: int,
     from cluster.workers.worker_group import make_worker
     from collector.watchdog import Limits
 
-    with TemporaryDirectory(prefix="adaafford-bench-") as scratch, ExitStack() as stack:
+    with scratch_folder("bench") as scratch, ExitStack() as stack:
         # The worker group that waits uses no processor.
         stack.enter_context(ray_session(workers + 1))
         stores, worker_groups = [], []
         for count in (1, workers):
-            store = Store.create(Path(scratch) / f"store-{count}", plan.setting)
+            store = Store.create(scratch / f"store-{count}", plan.setting)
             worker_group = RayWorkerGroup(partial(make_worker, store.path, folder), store.crash_log, count, Limits())
             stack.callback(worker_group.close)
             stores.append(store)

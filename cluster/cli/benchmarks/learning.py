@@ -1,9 +1,7 @@
 """How fast is training? The training loop of each critic is timed on stored interactions, turn by turn."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from statistics import median
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -18,6 +16,7 @@ from learner.stages.oracle import OracleCritic, Teacher
 from learner.stages.prior import PriorStage
 from learner.training.hardware import Hardware
 from learner.training.loop import Stage, train
+from shared.io.files import scratch_folder
 from shared.policies.policy import Policy
 from shared.progress import Advance
 from shared.store import Store
@@ -82,9 +81,9 @@ class LearningBenchmark:
 def training_rate(stage: Stage, settings: TrainingConfig, steps: int, seed: int, hardware: Hardware) -> float:
     """Interactions a second of the training loop, without validation and checkpoints."""
     quiet = {"steps": steps, "validate_every": NEVER, "checkpoint_seconds": NEVER, "seconds": None}
-    with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
+    with scratch_folder("bench") as scratch:
         timed = settings.model_copy(update=quiet)
-        result = train(stage, timed, seed, Path(scratch), hardware=hardware, silent=True)
+        result = train(stage, timed, seed, scratch, hardware=hardware, silent=True)
     return result.interactions / result.seconds
 
 

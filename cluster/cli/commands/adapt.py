@@ -42,8 +42,8 @@ class AdaptCommand:
     history: Path
     """The interactions so far (JSON), created if missing. Scans are in the same folder or below."""
     policy: str | None = None
-    """The name of a bundled policy, a folder with weights.safetensors and policy.json, or a finished run. Default: the
-    bundled policy, if there is only one."""
+    """The name of a bundled policy, a folder with weights.safetensors and policy.json, or a finished run. Without
+    it, the bundled ones are listed."""
     out: Path | None = None
     """File for the adapted affordance: .ply, .npz or .html; default: heatmap.ply beside the history."""
     part: str | None = None
@@ -105,6 +105,10 @@ def main(args: list[str]) -> int:
         )
     if command.budget < 1:
         raise UsageError(f"--budget {command.budget}: at least one interaction is needed to adapt")
+    if command.out is not None and not command.out.parent.is_dir():
+        raise UsageError(
+            f"--out {command.out}: there is no folder {command.out.parent}; create it, or name another place"
+        )
     if not MIN_SHOWN <= command.points <= MAX_SHOWN:
         raise UsageError(f"--points {command.points}: allowed are {MIN_SHOWN} to {MAX_SHOWN}")
     if command.arm is None and any(command.base):

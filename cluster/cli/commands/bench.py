@@ -12,7 +12,6 @@ from dataclasses import make_dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -20,12 +19,13 @@ from pydantic import Field
 
 from cluster.config.command_settings import ObjectSelection
 from cluster.config.flags import dispatch
-from shared.config import FIDELITIES, CollectionConfig, Fidelity
+from shared.config import FIDELITIES, CollectionConfig, Fidelity, FidelityVersion
 from shared.formatting import finite
-from shared.io.files import write_atomically, writing
+from shared.io.files import scratch_folder, write_atomically, writing
 from shared.progress import Progress
 
 if TYPE_CHECKING:
+    from cluster.cli.benchmarks.fidelity import FidelityResult
     from shared.plan import Plan
     from shared.store import Store
 
@@ -74,6 +74,11 @@ class FidelitySettings(BenchSettings):
     """The reference: the published timing."""
     candidate: Fidelity = FIDELITIES["fast"]
     """The fidelity that is compared: the default of collections."""
+    versions: tuple[FidelityVersion, ...] = ()
+    """Versions of it that are compared instead of its own, all in the same trials."""
+    quiet_share: float = Field(1.0, gt=0, le=1)
+    """Of the trials in which no candidate moves anything, the share that is also executed in the reference, which takes
+    most of the time; each then counts for several."""
 
 
 class DynamicsSettings(BenchSettings):
@@ -156,25 +161,46 @@ def run_benchmark(name: str, measure: Callable[[Any], dict[str, Any]], flags: An
 
 
 def _fidelity(command: FidelitySettings) -> dict[str, Any]:
-    from cluster.cli.benchmarks.fidelity import NEAR_THRESHOLD, compare
+    from cluster.cli.benchmarks.fidelity import compare
 
+    versions = command.versions or (command.candidate.version,)
+    candidates = [command.candidate.model_copy(update={"version": version}) for version in versions]
     with planned(command) as (plan, folder), Progress(f"trials, {command.task}", command.trials) as progress:
-        result = compare(plan, folder, command.reference, command.candidate, command.trials, progress.advance)
-    print(f"{result.trials} trials on {result.objects} objects, {result.positives} positives in the reference")
-    print(f"  label agreement   {result.label_agreement:.1%}")
-    print(f"  F1 of positives   {result.positive_f1:.3f}")
-    print(f"  kind agreement    {result.kind_agreement:.1%}")
+        reference, share = command.reference, command.quiet_share
+        results = compare(plan, folder, reference, candidates, command.trials, progress.advance, share)
+    for candidate, found in zip(candidates, results, strict=True):
+        print_fidelity(found, reference, candidate)
+    result = results[-1].as_json() | {"drawn": command.trials, "quiet_share": share}
+    result |= {"reference": reference.model_dump(), "candidate": candidates[-1].model_dump()}
+    if command.versions:
+        result["by_version"] = {str(v): found.as_json() for v, found in zip(versions, results, strict=True)}
+    return result
+
+
+def print_fidelity(result: "FidelityResult", reference: Fidelity, candidate: Fidelity) -> None:
+    """Print the figures of one candidate."""
+    from cluster.cli.benchmarks.fidelity import NEAR_THRESHOLD
+
     low, high = NEAR_THRESHOLD
-    print(f"  near threshold    {result.near_threshold} trials with m of {low} to {high}, ", end="")
-    print(f"{result.near_threshold_other_labels} with another label; without them: label agreement ", end="")
-    print(f"{result.clear_label_agreement:.1%}, F1 {result.clear_positive_f1:.3f}")
+    print(
+        f"{candidate.name}, version {candidate.version}: {result.trials} trials, which stand for "
+        f"{result.stands_for:.0f}, on {result.objects} objects, {result.positives} positives in the reference"
+    )
+    print(f"  label agreement   {result.label_agreement:.2%}")
+    print(f"  F1 of positives   {result.positive_f1:.3f} [{result.positive_f1_low:.3f}, {result.positive_f1_high:.3f}]")
+    print(f"  kind agreement    {result.kind_agreement:.2%}")
+    print(
+        f"  near threshold    {result.near_threshold} trials with m of {low} to {high}, "
+        f"{result.near_threshold_other_labels} with another label; without them: label agreement "
+        f"{result.clear_label_agreement:.2%}, F1 {result.clear_positive_f1:.3f}"
+    )
     print(f"  error of m        {result.motion_error_median:.2g} median, {result.motion_error_p95:.2g} at 95%")
-    print(f"  CPU ms a trial    {result.reference_ms:.1f} {command.reference.name}, ", end="")
-    print(f"{result.candidate_ms:.1f} {command.candidate.name}")
+    print(
+        f"  CPU ms a trial    {result.reference_ms:.1f} {reference.name}, "
+        f"{result.candidate_ms:.1f} {candidate.name} in {result.candidate_steps:.0f} steps"
+    )
     for change, count in result.confusions:
         print(f"  {count:>4} x {change}")
-    fidelities = {"reference": command.reference.model_dump(), "candidate": command.candidate.model_dump()}
-    return result.as_json() | fidelities
 
 
 def _dynamics(command: DynamicsSettings) -> dict[str, Any]:
@@ -205,8 +231,8 @@ def _collect(command: CollectSettings) -> dict[str, Any]:
         runs = []
         with Progress(f"jobs, {command.task}", command.repeats * jobs_of(command.rollouts)) as progress:
             for _ in range(command.repeats):
-                with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
-                    store = Store.create(Path(scratch) / "store", plan.setting)
+                with scratch_folder("bench") as scratch:
+                    store = Store.create(scratch / "store", plan.setting)
                     runs.append(collect(plan, folder, command.rollouts, store, progress.advance))
         result = summary(runs)
         print_collection(result)
@@ -272,8 +298,8 @@ def planned(command: BenchSettings) -> Iterator[tuple["Plan", Path]]:
 
     own = {} if command.primitive is None else {"primitive": command.primitive}
     collection = command.collection.model_copy(update=own)
-    with TemporaryDirectory(prefix="adaafford-bench-") as scratch:
-        built_in = Path(scratch) / "objects"
+    with scratch_folder("bench") as scratch:
+        built_in = scratch / "objects"
         catalogue, folder = objects_for(task, command, built_in, command.procedural_per_category, command.seed)
         refs = tuple(entry.ref for entry in catalogue.usable)
         yield Plan(setting=make_setting(task, collection, seed=command.seed, objects=refs)), folder
@@ -294,8 +320,8 @@ def stored(command: StoredSettings) -> Iterator["Store"]:
         return
     from cluster.cli.benchmarks.collecting import collect, jobs_of
 
-    with planned(command) as (plan, folder), TemporaryDirectory(prefix="adaafford-bench-") as scratch:
-        store = Store.create(Path(scratch) / "store", plan.setting)
+    with planned(command) as (plan, folder), scratch_folder("bench") as scratch:
+        store = Store.create(scratch / "store", plan.setting)
         with Progress(f"jobs of collection, {command.task}", jobs_of(command.rollouts)) as progress:
             collect(plan, folder, command.rollouts, store, progress.advance)
         yield store

@@ -107,6 +107,10 @@ def run_collection(command: CollectCommand) -> None:
     chosen, where = command.settings, absolute(command.store)
     task = chosen.task_record
     packages_used(task, chosen.collection)  # Refused before any object is read.
+    begun = Store.begun_with(where)
+    made = partial(make_setting, task, in_fidelity_of(where, begun, chosen.collection), seed=chosen.seed)
+    # Refused before built-in objects are made, which takes minutes.
+    Store.check_free(where, None if begun is None else made(objects=begun.objects))
     catalogue, folder = objects_for(
         task,
         chosen,
@@ -114,14 +118,7 @@ def run_collection(command: CollectCommand) -> None:
         chosen.procedural_per_category,
         chosen.seed,
     )
-    begun = Store.begun_with(where)
-    setting = make_setting(
-        task,
-        in_fidelity_of(where, begun, chosen.collection),
-        seed=chosen.seed,
-        objects=_begun_with(where, begun, tuple(entry.ref for entry in catalogue.usable)),
-    )
-    store = Store.create(where, setting)
+    store = Store.create(where, made(objects=_begun_with(where, begun, tuple(entry.ref for entry in catalogue.usable))))
     if changed := changed_versions(store.document.software):
         print(
             f"{store.where}: begun with other software: {changed}; new rows may differ because of it", file=sys.stderr
@@ -130,7 +127,7 @@ def run_collection(command: CollectCommand) -> None:
     if command.policy == "latest":
         plan = LatestPolicy(command.proposer, chosen.per_version)
     else:
-        plan = Plan(setting=setting, proposer=command.proposer, policy_version=command.policy)
+        plan = Plan(setting=store.setting, proposer=command.proposer, policy_version=command.policy)
     with (
         store.only_driver(alone=command.policy == "latest"),
         worker_groups(chosen.workers, chosen.limits, chosen.ray_address) as make_worker_group,

@@ -10,6 +10,7 @@ from pydantic import Field
 from cluster.config.flags import Action, dispatch
 from shared.config import PANDA
 from shared.errors import UsageError
+from shared.formatting import counted
 from shared.io.text import plain
 
 Direction = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
@@ -159,7 +160,7 @@ def _generate(command: GenerateCommand) -> int:
 
     counts = dict.fromkeys(expanded(command.categories) or CATEGORIES, command.per_category)
     made = generate(command.out, counts, command.seed)
-    print(f"{len(made)} objects of {len(counts)} categories in {command.out}")
+    print(f"{counted(len(made), 'object')} of {counted(len(counts), 'category', 'categories')} in {command.out}")
     return 0
 
 
@@ -278,10 +279,16 @@ def _draws_at_rest(entry: "CatalogueEntry", task: str | None) -> tuple[int, int]
     return draws_at_rest(Plan(setting=setting), 0, load(entry)), TRIES
 
 
+def _check_png(out: Path) -> None:
+    if out.suffix.lower() != ".png":
+        raise UsageError(f"{out}: not a kind of picture that is written; allowed: .png")
+
+
 def _preview(command: PreviewCommand) -> int:
     from collector.objects.catalogue import load, scan
     from collector.viz.preview import contact_sheet
 
+    _check_png(command.out)
     usable = scan(command.path).usable
     shown = usable[: command.most]
     contact_sheet([load(entry) for entry in shown], command.out)
@@ -294,6 +301,7 @@ def _film(command: FilmCommand) -> int:
     from collector.viz.film import film
     from shared.primitives import PRIMITIVES
 
+    _check_png(command.out)
     usable = scan(command.path).usable
     if not usable:
         raise UsageError(f"{command.path}: a film needs a usable object; try `adaafford objects check`")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from shared.policies.policy import Policy
 
 BUILT_IN_PER_CATEGORY = 4
+HISTORY = "history.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,19 +92,39 @@ def main(args: list[str]) -> int:
     if command.seed < 0:
         raise UsageError(f"--seed {command.seed}: needs a number that is not negative")
     require("adaafford rehearse", "collect", without=("ray",))
+    _refuse_other_sessions(command)
     if command.policy is None:
         return _follow(next(_robots(command, PANDA)))
     from adaafford.pretrained import load_policy
+    from shared.tasks import task_of
 
-    policy = load_policy(command.policy)
+    policy, task = load_policy(command.policy), task_of(command.task)
+    if policy.task != task.name:
+        raise UsageError(
+            f"--policy {command.policy}: is for '{policy.task}', but --task is '{task.name}'; name one of this task"
+        )
     ended = [_played(command, robot, policy) for robot in _robots(command, policy.gripper)]
     print(_summary(command, ended))
     return 0
 
 
+def _folder(command: RehearseCommand, number: int) -> Path:
+    """The folder of a rollout, from 0."""
+    return command.folder if command.rollouts == 1 else command.folder / f"{number + 1:04d}"
+
+
+def _refuse_other_sessions(command: RehearseCommand) -> None:
+    """Refuse folders with the history of a session that was no rehearsal, which writes its own state first."""
+    from cluster.evaluation.rehearsal import STATE
+
+    for folder in (_folder(command, number) for number in range(command.rollouts)):
+        if (folder / HISTORY).exists() and not (folder / STATE).exists():
+            raise UsageError(f"{folder}: has the {HISTORY} of another session; name another folder")
+
+
 def _robots(command: RehearseCommand, gripper: str) -> Iterator["SimulatedRobot"]:
     """The robots of the command, with this hand, each made when it is its turn."""
-    from cluster.cli.library import simulated
+    from cluster.cli.library import simulated_again
     from cluster.config.objects import built_in_categories
     from cluster.evaluation.rehearsal import Setting, SimulatedRobot
     from collector.objects.procedural.catalogue import generate
@@ -114,9 +135,9 @@ def _robots(command: RehearseCommand, gripper: str) -> Iterator["SimulatedRobot"
     if objects is None:
         objects = command.folder / "objects"
         generate(objects, dict.fromkeys(built_in_categories(task_of(command.task), ()), BUILT_IN_PER_CATEGORY), 1)
-    found = simulated(objects, command.task, command.seed, gripper, command.arm)
-    for number, environment in enumerate(islice(found, command.rollouts)):
-        folder = command.folder if command.rollouts == 1 else command.folder / f"{number + 1:04d}"
+    found = simulated_again(objects, command.task, command.seed, gripper, command.arm)
+    for number, (environment, again) in enumerate(islice(found, command.rollouts)):
+        folder = _folder(command, number)
         make_folder(folder)
         setting = Setting(
             task=task_of(command.task).name,
@@ -128,7 +149,7 @@ def _robots(command: RehearseCommand, gripper: str) -> Iterator["SimulatedRobot"
             arm=command.arm,
             scene=command.scene,
         )
-        yield SimulatedRobot(environment, setting, folder)
+        yield SimulatedRobot(environment, again, setting, folder)
 
 
 def _follow(robot: "SimulatedRobot") -> int:
@@ -154,7 +175,7 @@ def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy")
     from shared.arms.arm import arm_of
 
     folder = robot.folder
-    files = SessionFiles(folder / "history.json", folder / "heatmap.ply")
+    files = SessionFiles(folder / HISTORY, folder / "heatmap.ply")
     session = Session(
         policy,
         files,

@@ -109,6 +109,8 @@ def table(snapshot: "StatusSnapshot", now: float) -> "Table":
 
 
 def _store_rows(store: "StoreSnapshot", now: float) -> list[tuple[str, str]]:
+    from cluster.collection.status_writer import SILENT_S
+
     held = ", ".join(f"{key} {count}" for key, count in store.rollouts.items()) or "none"
     policies = f"{len(store.policies)}, newest {store.policies[-1]}" if store.policies else "none"
     rows = [("store", store.where), ("rollouts", held), ("policies", policies)]
@@ -116,8 +118,11 @@ def _store_rows(store: "StoreSnapshot", now: float) -> list[tuple[str, str]]:
     if driver is None:
         return [*rows, ("collection", "none has begun")]
     state = driver.state if store.driver_alive or driver.state in ("done", "stopped") else "its driver is gone"
+    ago = f"{_duration(now - driver.written)} ago"
+    if driver.written - now >= SILENT_S:
+        ago = f"by a clock that is {_duration(driver.written - now)} ahead of this machine's"
     rows += [
-        ("collection", f"{driver.title}: {state}, written {_duration(now - driver.written)} ago"),
+        ("collection", f"{driver.title}: {state}, written {ago}"),
         ("done", f"{driver.done} of {driver.total} rollouts, {driver.left} left{_left(driver.left_s)}"),
         ("rate", f"{driver.recent_per_s:.1f} interactions/s of late, {driver.per_s:.1f} in all"),
         ("successful", f"{driver.success_rate:.1%} of {driver.interactions} interactions"),

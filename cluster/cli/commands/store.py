@@ -11,7 +11,7 @@ from cluster.cli.commands import upkeep
 from cluster.cli.commands.replay import ReplayCommand, replay
 from cluster.config.flags import Action, dispatch
 from shared.errors import UsageError
-from shared.formatting import finite
+from shared.formatting import counted, finite
 from shared.io.text import plain
 from shared.progress import Progress
 
@@ -126,7 +126,8 @@ def _verify(command: VerifyCommand) -> int:
         return 1 if problems else 0
     for problem in problems:
         print(plain(f"{problem.where}: {problem.what}"))
-    print(f"{len(problems)} problems" if problems else f"no problems in {len(store.jobs())} shards")
+    shards = counted(len(store.jobs()), "shard")
+    print(counted(len(problems), "problem") if problems else f"no problems in {shards}")
     if divergence is not None:
         _print_divergence(divergence)
     return 1 if problems else 0

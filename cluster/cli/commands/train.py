@@ -48,23 +48,24 @@ class LearnerCommand:
     config: Path | None = None
     """A TOML file of settings; flags replace them."""
 
-    def job(self, stage: "StageName" = "prior", init: Path | None = None) -> "StageJob":
+    def job(self, stage: "StageName" = "prior", init: str | None = None) -> "StageJob":
         """What is trained on."""
+        from cluster.runs.warm_start import folder_of
         from learner.data.sampling import read_object_list
         from learner.stages.jobs import StageJob
 
         train, validation = read_object_list(self.train_objects), read_object_list(self.validation_objects)
-        return StageJob(stage, self.store, self.out, init, train, validation)
+        return StageJob(stage, self.store, self.out, None if init is None else folder_of(init), train, validation)
 
 
 @dataclass(frozen=True, slots=True)
 class TrainCommand(LearnerCommand):
     """Train networks from a finished store. Give the same command again to continue."""
 
-    init: Path | None = None
-    """The --out of the previous stage, whose networks are the start. The prior, and an alternation, may start from any
-    policy; if --network.pinch-profile or --network.roll-symmetry is set and it lacks it, AAP and AIP are trained anew
-    from its weights."""
+    init: str | None = None
+    """The --out of the previous stage, whose networks are the start, or a bundled policy by name (./NAME: a folder).
+    The prior, and an alternation, may start from any policy; if --network.pinch-profile or --network.roll-symmetry is
+    set and it lacks it, AAP and AIP are trained anew from its weights."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ import tyro
 
 from cluster.config.flags import Action
 from shared.errors import StoreError, UsageError
+from shared.formatting import counted
 from shared.io.text import plain
 from shared.progress import Progress
 
@@ -142,7 +143,8 @@ def _compact(command: CompactCommand) -> int:
     if command.json:
         print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
         return 0
-    print(f"{done.before} shards became {done.after}; {len(done.set_aside)} small ones are in {store.where}/aside")
+    aside = counted(len(done.set_aside), "small one is", "small ones are")
+    print(f"{counted(done.before, 'shard')} became {done.after}; {aside} in {store.where}/aside")
     return 0
 
 
@@ -157,7 +159,8 @@ def _merge(command: MergeCommand) -> int:
     if command.json:
         print(json.dumps(asdict(done) | {"digest": store.digest()}, indent=2))
         return 0
-    print(f"{done.rollouts} rollouts in {done.shards} shards, {done.in_several} of them in several stores alike")
+    made = f"{counted(done.rollouts, 'rollout')} in {counted(done.shards, 'shard')}"
+    print(f"{made}, {done.in_several} of them in several stores alike")
     print(f"into {store.where}, digest {store.digest()}")
     return 0
 

@@ -17,7 +17,7 @@ from collector.objects.model import ObjectModel, bodies_of, bounding_box, model_
 from collector.objects.partnet import META_FILE
 from collector.objects.readers import Description, read_object
 from collector.objects.urdf_bodies import listed
-from collector.objects.writing import write_object
+from collector.objects.writing import holds, object_files, write_folder
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.extras import require_packages
 from shared.io.files import read_bounded, remove_remnants, remove_tree, temporary_name, writing
@@ -73,14 +73,14 @@ class Imported:
 def import_object(source: Source, folder: Path, settings: ImportSettings) -> Imported:
     """Import `source` as `folder`, whose name becomes the object's id; it appears whole or not at all.
 
+    A folder that holds the same is left as it is, so that a call that was interrupted can be repeated.
+
     Raises:
         ObjectError: it cannot be read, or `objects check` would refuse it.
-        UsageError: a setting cannot be honoured, or `folder` is there already or cannot be written.
+        UsageError: a setting cannot be honoured, or `folder` holds another object or cannot be written.
     """
-    if folder.exists() and not (settings.replace and _was_imported(folder)):
-        raise UsageError(
-            f"{folder}: is there already; name another by --id, or give --replace where it was imported before"
-        )
+    if folder.exists() and not _was_imported(folder):
+        raise _taken(folder)
     described = _read(source, settings)
     category = described.category if settings.category is None else settings.category
     try:
@@ -94,7 +94,7 @@ def import_object(source: Source, folder: Path, settings: ImportSettings) -> Imp
     notes = list(described.notes)
     if turned:
         notes.append(f"{len(turned)} joints that closed at their upper limit turned round ({listed(turned)})")
-    written = _write(folder, final, source)
+    written = _write(folder, final, source, replace=settings.replace)
     return Imported(
         folder,
         ArticulatedObject(written.ref, bodies_of(usual)),
@@ -130,21 +130,33 @@ def _read(source: Source, settings: ImportSettings) -> Description:
     return replace(described, bodies=bodies)
 
 
-def _write(folder: Path, model: ObjectModel, source: Source) -> ArticulatedObject:
+def _taken(folder: Path) -> UsageError:
+    return UsageError(
+        f"{folder}: is there already; name another by --id, or give --replace where it was imported before"
+    )
+
+
+def _write(folder: Path, model: ObjectModel, source: Source, *, replace: bool) -> ArticulatedObject:
     """Write the object, if it can be read again."""
     digest = hashlib.sha256(read_bounded(source.file, 1 << 30)).hexdigest()
     meta = {IMPORTED: {"file": source.file.name, "layout": source.layout, "sha256": digest}}
+    files = object_files(model, meta)
     with writing(folder, "name a folder that can"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         remove_remnants(folder.parent)
         scratch = folder.parent / temporary_name(folder.name)
         try:
-            written = write_object(scratch / folder.name, model, meta)
+            written = write_folder(scratch / folder.name, files)
             try:
                 judged = read_object(written)
             except ObjectError as error:
                 raise ObjectError(str(error).replace(str(written), str(source.file))) from None
-            remove_tree(folder)
+            if holds(folder, files):
+                return judged
+            if folder.exists():
+                if not replace:
+                    raise _taken(folder)
+                folder.rename(scratch / "replaced")
             written.rename(folder)
         finally:
             remove_tree(scratch)

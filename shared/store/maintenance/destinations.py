@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from shared.errors import StoreError, UnreadableError, UsageError
@@ -22,6 +21,7 @@ from shared.io.files import (
     read_bounded,
     remove_remnants,
     remove_tree,
+    scratch_folder,
     sync_file,
     sync_folder,
     write_atomically,
@@ -100,8 +100,8 @@ class DiskDestination:
     """See `Destination`."""
 
     def __init__(self, out: Path) -> None:
-        if os.path.lexists(out):
-            raise UsageError(f"{out}: is there already; name a new folder")
+        if os.path.lexists(out) and not (out / NOTES / BEGUN).is_file():
+            raise _there_already(out)
         self._out = out
         self.folder = out.with_name(out.name + UNFINISHED)
         self._notes = self.folder / NOTES
@@ -110,6 +110,11 @@ class DiskDestination:
     def begin(self, identity: dict[str, Any]) -> Iterator[None]:
         """See `Destination.begin`."""
         folder, notes = self.folder, self._notes
+        if os.path.lexists(self._out):
+            # It was killed after it had its name, and before its notes were gone.
+            if _note(self._out / NOTES / BEGUN) != identity:
+                raise _there_already(self._out)
+            self._out.rename(folder)
         folder.mkdir(parents=True, exist_ok=True)
         if not notes.is_dir() and any(folder.iterdir()):
             raise UsageError(
@@ -129,10 +134,7 @@ class DiskDestination:
 
     def note(self, name: str) -> dict[str, Any] | None:
         """See `Destination.note`."""
-        try:
-            return parse_object(read_bounded(self._notes / name, MAX_DOCUMENT_BYTES), str(self._notes / name))
-        except StoreError:
-            return None
+        return _note(self._notes / name)
 
     def add_note(self, name: str, note: Mapping[str, Any]) -> None:
         """See `Destination.add_note`."""
@@ -189,8 +191,8 @@ class BucketDestination:
     @contextmanager
     def begin(self, identity: dict[str, Any]) -> Iterator[None]:
         """See `Destination.begin`."""
-        with TemporaryDirectory(prefix="adaafford-export-") as staging, present(self._notes, "export", alone=True):
-            self._staging, self.folder = Path(staging), Path(staging, "out")
+        with scratch_folder("export") as staging, present(self._notes, "export", alone=True):
+            self._staging, self.folder = staging, staging / "out"
             self.folder.mkdir()
             if self.note(BEGUN) != identity:
                 for key in self._backend.leaves(""):
@@ -274,6 +276,18 @@ def _going_on() -> Iterator[None]:
         yield
     except UnreadableError as error:
         raise UnreadableError(f"{error}; what is finished is in the bucket: {_GO_ON}") from None
+
+
+def _there_already(out: Path) -> UsageError:
+    return UsageError(f"{out}: is there already; name a new folder")
+
+
+def _note(path: Path) -> dict[str, Any] | None:
+    """A note on a disk; None where it is missing or was damaged."""
+    try:
+        return parse_object(read_bounded(path, MAX_DOCUMENT_BYTES), str(path))
+    except StoreError:
+        return None
 
 
 def _emptied(folder: Path) -> Path:
