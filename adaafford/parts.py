@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 
 from adaafford.pretrained import PRETRAINED_FOLDER
 from adaafford.scans import MAX_COORDINATE, Scan, ScanFrame, Vector
@@ -35,6 +36,10 @@ PICTURE_POINTS = 60_000
 """Of a raw scan, in the picture of its parts."""
 PARTS_SUFFIX = "-parts"
 """Of the picture, beside the heatmap."""
+FLOATING, NEIGHBOUR, MOST_FLOATING = 2.0, 3, 0.1
+"""A point of the object floats where its third nearest neighbour is further than twice the median of these distances.
+A depth camera measures a few such points between two surfaces; where they would be more than a tenth, the scan is
+uneven instead, as one of several views is."""
 _CHOSEN, _OTHER, _BODY, _BACKGROUND = 1.0, 0.75, 0.5, 0.0
 """Their values in the picture, which is coloured as a heatmap is."""
 
@@ -126,7 +131,7 @@ class CutOut:
     """A raw scan with the object cut out and one part marked.
 
     Attributes:
-        scan: of the object alone; `movable` marks the part.
+        scan: of the object alone, without points that float between surfaces; `movable` marks the part.
         answer: which part that is, and what the others are.
         whole: the raw scan.
         shades: [M], of all points of the raw scan: 1 on the part, 0.75 on others, 0.5 on the body, 0 elsewhere.
@@ -197,7 +202,9 @@ class PartFinder:
         for part in parts:
             shades[part.points] = _OTHER
         shades[parts[chosen].points] = _CHOSEN
-        rows = found.object
+        rows = found.object[_on_surfaces(scan.points[found.object])]
+        if not (shades[rows] == _CHOSEN).any():
+            rows = found.object
         cut = replace(
             scan,
             points=scan.points[rows],
@@ -234,6 +241,16 @@ class PartFinder:
             if part.kind in self._kinds or wanted.confidence >= LEAST_CONFIDENCE:
                 suitable.append(wanted)
         return tuple(sorted(suitable, key=lambda part: -part.confidence))
+
+
+def _on_surfaces(points: Float) -> NDArray[np.bool_]:
+    """Which points, [N, 3], lie among others as those of a surface do; where they float, a hand would close on air."""
+    if len(points) <= NEIGHBOUR:
+        return np.ones(len(points), dtype=bool)
+    away = np.asarray(cKDTree(points).query(points, k=[NEIGHBOUR + 1], workers=-1)[0])[:, 0]
+    floating = away > FLOATING * np.median(away)
+    lies: NDArray[np.bool_] = ~floating if floating.mean() <= MOST_FLOATING else np.ones(len(points), dtype=bool)
+    return lies
 
 
 @cache

@@ -156,6 +156,34 @@ def test_a_task_that_acts_on_all_parts_finds_what_slides() -> None:
     assert cut.scan.movable is not None and cut.scan.movable.sum() == 100
 
 
+class GridSegmenter(Segmenter):
+    """Everything is of the object, and what is nearer than x = 1 is a door."""
+
+    def __init__(self) -> None:
+        pass
+
+    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+        door = Part(np.flatnonzero(points[:, 0] < 1.0), {Kind.TURNING: 0.9, Kind.SLIDING: 0.0})
+        return Segmentation(np.arange(len(points)), (door,))
+
+
+def test_points_that_float_between_surfaces_are_not_of_the_object() -> None:
+    def plane(x: float) -> Float:
+        y, z = np.meshgrid(np.arange(60) * 0.01, np.arange(60) * 0.01)
+        return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1)
+
+    floating = np.array([[1.2, -0.03, 0.1], [0.95, 0.63, 0.3], [1.1, 0.62, 0.5]])
+    scan = Scan(np.concatenate([plane(0.9), plane(1.4), floating]))
+    cut = PartFinder("push", GridSegmenter()).cut_out(scan, UP, CAMERA, "auto", None, "scan")
+    assert np.array_equal(cut.scan.points, np.concatenate([plane(0.9), plane(1.4)]))
+    assert cut.scan.rows is not None and np.array_equal(cut.scan.rows, np.arange(7200))
+    assert len(cut.shades) == len(scan.points)
+    # Where one of several views is much finer, the points of the others are no noise.
+    uneven = Scan(np.concatenate([plane(0.9)[:1800], plane(1.4)[::7]]))
+    whole = PartFinder("push", GridSegmenter()).cut_out(uneven, UP, CAMERA, "auto", None, "scan")
+    assert np.array_equal(whole.scan.points, uneven.points)
+
+
 def test_for_a_task_about_doors_the_confidence_is_that_a_part_turns() -> None:
     thirds = np.split(np.arange(300), 3)
     told = (

@@ -7,14 +7,49 @@ the door is free, and the controls move.
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces
-from collector.objects.procedural.assembly import hinged, sliding
+from collector.objects.procedural.assembly import either, hinged, sliding
 from collector.objects.procedural.cabinets import GAP, knob
-from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, rod
+from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, moved, rod
 
 BUTTON_TRAVEL = 0.03
 
 
 def random_microwave(rng: np.random.Generator) -> ObjectModel:
+    """One with large buttons and a handle, or a plain one, equally often."""
+    return either(rng, _random_large_buttons, _random_plain_microwave)
+
+
+def _random_plain_microwave(rng: np.random.Generator) -> ObjectModel:
+    """A door flush with its case, perhaps with a bar, before a turntable; beside it a panel, perhaps with a knob."""
+    width, depth, height = (float(size) for size in rng.uniform((0.9, 0.6, 0.5), (1.4, 0.95, 0.85)))
+    wall, thickness = float(rng.uniform(0.025, 0.06)), float(rng.uniform(0.025, 0.07))
+    half, split = width / 2, -width / 2 + float(rng.uniform(0.12, 0.32)) * width
+    below = float(rng.choice([0.0, rng.uniform(0.05, 0.15) * height]))
+    body = (
+        *hollow_box((0.0, split, below), (depth, half, height), wall, (FRONT,)),
+        block((-thickness, -half, 0.0), (depth, split - GAP, height)),
+    )
+    if below:
+        body += (block((-thickness, split - GAP, 0.0), (depth, half, below - GAP)),)
+    low, high = (-GAP - thickness, split + GAP, below), (-GAP, half, height)
+    pieces: Pieces = (block(low, high),)
+    middle = (low[2] + high[2]) / 2
+    if rng.random() < 0.4:
+        pieces += grip((low[0], split + 0.07, middle), TOP, FRONT, 0.5 * (high[2] - low[2]), 0.05, 0.01)
+    door = hinged("door", pieces, (low[0], half, middle), LEFT, FRONT, float(rng.uniform(1.4, 2.2)))
+    parts = [door]
+    centre, radius = (
+        (depth / 2, (split + half) / 2, below + wall),
+        0.42 * min(depth - 2 * wall, half - split - 2 * wall),
+    )
+    plate = rod(centre, (centre[0], centre[1], centre[2] + 0.02), radius, sides=24)
+    parts.append(MovablePart("tray", "revolute", moved((plate,), (0.0, 0.0, 0.004)), centre, TOP, 2 * np.pi))
+    if rng.random() < 0.5:
+        parts.append(knob("knob", (-thickness, (-half + split) / 2, float(rng.uniform(0.2, 0.8)) * height), 0.05))
+    return ObjectModel("Microwave", "microwave_body", body, tuple(parts))
+
+
+def _random_large_buttons(rng: np.random.Generator) -> ObjectModel:
     """A door hinged at the left, and buttons and perhaps a dial at its right."""
     width, depth, height = float(rng.uniform(1.2, 1.5)), float(rng.uniform(0.8, 1.0)), float(rng.uniform(0.65, 0.85))
     panel, thickness = float(rng.uniform(0.25, 0.35)), 0.05
@@ -29,7 +64,9 @@ def random_microwave(rng: np.random.Generator) -> ObjectModel:
     door = hinged("door", pieces, (low[0], half, height / 2), LEFT, FRONT, float(rng.uniform(1.5, 2.0)))
     middle = (-half + split) / 2
     rows = np.linspace(0.15, 0.55, int(rng.integers(2, 5))) * height
-    buttons = [_button(-thickness, middle + y, float(z), 0.045) for z in rows for y in (-0.07, 0.07)]
+    # Four rows on a low front would overlap, and never come to rest.
+    size = min(0.045, 0.45 * float(rows[1] - rows[0]))
+    buttons = [_button(-thickness, middle + y, float(z), size) for z in rows for y in (-0.07, 0.07)]
     dial = [knob("knob", (-thickness, middle, 0.8 * height), 0.07)] if rng.random() < 0.5 else []
     return ObjectModel("Microwave", "microwave_body", body, (door, *buttons, *dial))
 

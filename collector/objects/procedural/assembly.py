@@ -1,10 +1,12 @@
 """An object under construction: a static body and the parts that hang on it, all in one frame, all closed."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point, bounding_box, mapped, point
+from collector.objects.procedural.shapes import moved
 from shared.types import Float
 
 GRID = 2.0**-14
@@ -30,6 +32,11 @@ def hinged(name: str, pieces: Pieces, corner: Point, edge: Point, outward: Point
 def sliding(name: str, pieces: Pieces, direction: Point, upper: float) -> MovablePart:
     """A part that slides along `direction`."""
     return MovablePart(name, "prismatic", pieces, (0.0, 0.0, 0.0), direction, upper)
+
+
+def shifted(part: MovablePart, by: Point) -> MovablePart:
+    """The part somewhere else."""
+    return replace(part, pieces=moved(part.pieces, by), origin=point(np.add(part.origin, by)))
 
 
 def either(

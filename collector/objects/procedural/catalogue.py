@@ -16,7 +16,6 @@ from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import (
     random_refrigerator,
     random_safe,
-    random_table,
 )
 from collector.objects.procedural.containers import (
     random_box,
@@ -25,6 +24,7 @@ from collector.objects.procedural.containers import (
     random_kitchen_pot,
     random_trash_can,
 )
+from collector.objects.procedural.desks import random_table_or_desk
 from collector.objects.procedural.faucets import random_faucet
 from collector.objects.procedural.fitted import random_cabinet
 from collector.objects.procedural.openings import (
@@ -50,7 +50,7 @@ CATEGORIES: Mapping[str, Callable[[np.random.Generator], ObjectModel]] = {
     "Kettle": random_kettle,
     "Switch": random_switch,
     "Window": random_window,
-    "Table": random_table,
+    "Table": random_table_or_desk,
     "WashingMachine": random_washing_machine,
     "Bucket": random_bucket,
     "KitchenPot": random_kitchen_pot,

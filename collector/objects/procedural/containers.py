@@ -3,12 +3,34 @@
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
-from collector.objects.procedural.assembly import hinged, sliding
+from collector.objects.procedural.assembly import either, hinged, sliding
 from collector.objects.procedural.cabinets import GAP
-from collector.objects.procedural.shapes import BACK, LEFT, RIGHT, TOP, arch, block, hollow_box, moved, rod, tub
+from collector.objects.procedural.shapes import (
+    BACK,
+    BOTTOM,
+    FRONT,
+    LEFT,
+    RIGHT,
+    TOP,
+    arch,
+    block,
+    hollow_box,
+    moved,
+    rod,
+    tub,
+)
 
 
 def random_box(rng: np.random.Generator) -> ObjectModel:
+    """A box with thick walls, or a carton or a chest, equally often."""
+    return either(rng, _random_thick_box, _random_carton_or_chest)
+
+
+def _random_carton_or_chest(rng: np.random.Generator) -> ObjectModel:
+    return _random_chest(rng) if rng.random() < 0.35 else _random_carton(rng)
+
+
+def _random_thick_box(rng: np.random.Generator) -> ObjectModel:
     """A box with one lid hinged at the back, or two flaps that meet in the middle."""
     width, depth, height = float(rng.uniform(0.9, 1.3)), float(rng.uniform(0.7, 1.1)), float(rng.uniform(0.5, 0.9))
     body = hollow_box((0.0, -width / 2, 0.0), (depth, width / 2, height), 0.03, (TOP,))
@@ -22,6 +44,52 @@ def random_box(rng: np.random.Generator) -> ObjectModel:
             _lid(low, (high[0], -GAP / 2, high[2]), RIGHT, opens),
         )
     return ObjectModel("Box", "box_body", body, lids)
+
+
+def _random_carton(rng: np.random.Generator) -> ObjectModel:
+    """A box of thin board with two or four flaps, which leave the middle open if they are short."""
+    width, depth, height = (float(size) for size in rng.uniform((0.5, 0.4, 0.25), (1.3, 1.1, 1.0)))
+    wall = float(rng.uniform(0.01, 0.02))
+    body = hollow_box((0.0, -width / 2, 0.0), (depth, width / 2, height), wall, (TOP,))
+    four, opens = bool(rng.random() < 0.6), float(rng.uniform(1.8, 2.8))
+    reach = float(rng.uniform(0.25, 0.5)) * width - GAP / 2
+    low, high = height + GAP, height + GAP + wall
+
+    def at_sides(end: float) -> tuple[MovablePart, ...]:
+        front, back = end + GAP, depth - end - GAP
+        return (
+            _lid((front, width / 2 - reach, low), (back, width / 2, high), LEFT, opens),
+            _lid((front, -width / 2, low), (back, reach - width / 2, high), RIGHT, opens),
+        )
+
+    def at_ends(end: float) -> tuple[MovablePart, ...]:
+        return (
+            _lid((0.0, -width / 2, low), (end, width / 2, high), FRONT, opens),
+            _lid((depth - end, -width / 2, low), (depth, width / 2, high), BACK, opens),
+        )
+
+    if four:
+        end = float(rng.uniform(0.15, 0.35)) * depth
+        flaps = at_sides(end) + at_ends(end)
+    else:
+        flaps = at_ends(0.3 * depth) if rng.random() < 0.5 else at_sides(0.0)
+    return ObjectModel("Box", "box_body", body, flaps)
+
+
+def _random_chest(rng: np.random.Generator) -> ObjectModel:
+    """A low case with compartments, whose hollow lid turns up at the back; perhaps a latch plate in front."""
+    width, depth, height = (float(size) for size in rng.uniform((0.8, 0.5, 0.25), (1.3, 0.9, 0.5)))
+    wall, rim = float(rng.uniform(0.02, 0.035)), float(rng.uniform(0.05, 0.2))
+    body = hollow_box((0.0, -width / 2, 0.0), (depth, width / 2, height), wall, (TOP,))
+    columns = np.linspace(-width / 2, width / 2, int(rng.integers(1, 5)) + 1)[1:-1]
+    inner = float(rng.uniform(0.6, 0.9)) * height
+    body += tuple(block((wall, y - 0.008, wall), (depth - wall, y + 0.008, inner)) for y in columns)
+    bottom = height + GAP
+    shell = hollow_box((0.0, -width / 2, bottom), (depth, width / 2, bottom + rim), wall, (BOTTOM,))
+    if rng.random() < 0.5:
+        shell += (block((-0.02, -0.06, bottom), (0.0, 0.06, bottom + 0.6 * rim)),)
+    lid = hinged("rotation_lid", shell, (depth, 0.0, bottom), BACK, TOP, float(rng.uniform(1.2, 1.7)))
+    return ObjectModel("Box", "box_body", body, (lid,))
 
 
 def random_trash_can(rng: np.random.Generator) -> ObjectModel:
