@@ -14,6 +14,7 @@ from learner.data.dataset import Dataset, Rows
 from shared.networks.aap import Aap
 from shared.networks.pointnet2 import CloudBatch, PointNet2
 from shared.networks.prior import Prior
+from shared.policies.imagined_outcomes import divergence
 
 ENCODING_CHUNK = 16
 """Clouds encoded at once; bounds memory."""
@@ -221,3 +222,25 @@ class FrozenAap:
         return self.aap.prefix_latents(
             torch.cat([before, codes[..., None, :]], dim=-2), torch.cat([before_weights, weights[..., None]], dim=-1)
         )[..., -1, :]
+
+    def expected_divergence(
+        self, candidates: Tensor, made: Tensor, latents: Tensor, imagined: list[tuple[Tensor, Tensor]]
+    ) -> tuple[Tensor, Tensor]:
+        """How far beliefs are expected to move, nats, by each candidate after rows that were made.
+
+        Args:
+            candidates: rows, [B, C].
+            made: rows, [B, K].
+            latents: their z, [B, 1, latent_width].
+            imagined: of the candidates had they failed, and had they succeeded (see `imagined`).
+
+        Returns:
+            Beliefs in the candidates, [B, C], and the divergence in each of them by each of them, [B, C, C].
+        """
+        believed = torch.sigmoid(self.logits(candidates, latents))
+        expected = torch.zeros(*candidates.shape, candidates.shape[1])
+        for odds, (codes, weights) in zip((1.0 - believed, believed), imagined, strict=True):
+            # One more axis, so that every candidate is asked about after every candidate.
+            after = self.logits(candidates[:, None], self.latents_with(made, codes, weights)[:, :, None])
+            expected += odds[..., None] * divergence(torch.sigmoid(after), believed[:, None])
+        return believed, expected

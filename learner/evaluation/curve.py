@@ -28,7 +28,6 @@ from learner.stages.oracle import OracleCritic
 from learner.training.losses import action_scoring_losses
 from shared.networks.aip import Aip
 from shared.networks.prior import Prior
-from shared.policies.imagined_outcomes import divergence
 
 _CHUNK = 16
 
@@ -273,21 +272,9 @@ def _choose(candidates: Tensor, frozen: FrozenAap, most: int) -> Tensor:
     free = torch.ones(candidates.shape, dtype=torch.bool)
     made = candidates[:, :0]
     for _ in range(most):
-        expected = _expected_divergence(candidates, frozen, made, imagined)
+        latents = frozen.latents(made)[:, -1:]
+        expected = frozen.expected_divergence(candidates, made, latents, imagined)[1].mean(dim=-1)
         best = torch.where(free, expected, -torch.inf).argmax(dim=1, keepdim=True)
         free.scatter_(1, best, False)
         made = torch.cat([made, candidates.gather(1, best)], dim=1)
     return made
-
-
-def _expected_divergence(
-    candidates: Tensor, frozen: FrozenAap, made: Tensor, imagined: list[tuple[Tensor, Tensor]]
-) -> Tensor:
-    """How far beliefs in all candidates are expected to move, nats, after each of them was tried as well, [R, c]."""
-    believed = torch.sigmoid(frozen.logits(candidates, frozen.latents(made)[:, -1:]))
-    expected = torch.zeros_like(believed)
-    for odds, (codes, weights) in zip((1.0 - believed, believed), imagined, strict=True):
-        # One more axis, so that every candidate is asked about after every candidate.
-        after = frozen.logits(candidates[:, None], frozen.latents_with(made, codes, weights)[:, :, None])
-        expected += odds * divergence(torch.sigmoid(after), believed[:, None]).mean(dim=-1)
-    return expected

@@ -21,7 +21,6 @@ from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_losses, information_gains, information_loss, mean_information_loss
 from shared.networks.aip import Aip
-from shared.policies.imagined_outcomes import divergence
 
 VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 21
@@ -156,11 +155,7 @@ class AipStage:
         others = (asked[:, None] & ~torch.eye(rows.shape[1], dtype=torch.bool)).to(latents.dtype)
         gains, scores = [], []
         for k in range(context):
-            believed = torch.sigmoid(frozen.logits(rows, latents[:, k, None]))
-            moved = torch.zeros_like(others)
-            for odds, (codes, weights) in zip((1.0 - believed, believed), imagined, strict=True):
-                after = frozen.logits(rows[:, None], frozen.latents_with(rows[:, :k], codes, weights)[:, :, None])
-                moved += odds[..., None] * divergence(torch.sigmoid(after), believed[:, None])
+            believed, moved = frozen.expected_divergence(rows, rows[:, :k], latents[:, k, None], imagined)
             gains.append((moved * others).sum(dim=-1) / others.sum(dim=-1).clamp_min(1.0))
             scores.append(believed)
         mask = ordered.asked(context)[:, :-1] & (others > 0).any(dim=-1)[:, None]
