@@ -15,14 +15,13 @@ from cluster.evaluation.tables import (
     ORDER,
     WITHOUT_TRIES,
     Measure,
-    ResultRow,
     ResultRows,
     like_for_like_note,
 )
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
 from cluster.reporting.style import COLOURS, SOFT, laid_out
 from cluster.runs.run_folder import read_json
-from learner.evaluation.table import ORACLE_METHOD, PRIOR_METHOD
+from learner.evaluation.table import ORACLE_METHOD, PRIOR_METHOD, EvaluationRow
 from shared.config import parse
 from shared.formatting import number, percent
 
@@ -40,7 +39,7 @@ class Results:
     """
 
     task: str
-    rows: tuple[ResultRow, ...]
+    rows: tuple[EvaluationRow, ...]
     novel_categories: bool = False
     objects: int = 0
     exploit_share: float | None = None
@@ -61,7 +60,7 @@ class Results:
         """Whether the paper has figures for the task."""
         return bool(published(self.task, novel_categories=self.novel_categories))
 
-    def row(self, method: str, budget: int) -> ResultRow | None:
+    def row(self, method: str, budget: int) -> EvaluationRow | None:
         """The row of a method at a budget; methods without interactions have a single row."""
         own = [row for row in self.rows if row.method == method]
         exact = next((row for row in own if row.budget == budget), None)
@@ -178,7 +177,7 @@ def table_of(results: Results, caption: str = "", measures: Mapping[Measure, str
 
 def details_of(results: Results) -> Table:
     """Everything that is known of every row."""
-    names = [name for name in ResultRow.model_fields if name != "method"]
+    names = [name for name in EvaluationRow.model_fields if name not in ("task", "method", "counts")]
     head: Row = (Cell("method", kind="name"), *(Cell(name.replace("_", " ")) for name in names))
     body = tuple(
         (Cell(row.method, kind="name"), *(Cell(number(getattr(row, name))) for name in names)) for row in results.rows
@@ -186,7 +185,7 @@ def details_of(results: Results) -> Table:
     return Table((head,), body, "All figures of all rows", folded=True)
 
 
-def _cell(row: ResultRow | None, measure: Measure, best: float | None) -> Cell:
+def _cell(row: EvaluationRow | None, measure: Measure, best: float | None) -> Cell:
     if row is None or (value := row.value(measure)) is None:
         return Cell("")
     interval = row.interval(measure)

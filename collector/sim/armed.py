@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from collector.objects.articulation import surface_at
-from collector.sim.simulator import PrivilegedState, SimEnvironment
-from collector.stopwatch import StageClock
+from collector.sim.simulator import PrivilegedState, SimEnvironment, StageClock
 from shared.arms.arm import Arm
 from shared.arms.reach import ArmReach
 from shared.primitives import PRIMITIVES

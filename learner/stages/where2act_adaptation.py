@@ -12,7 +12,7 @@ from learner.data.features import FrozenFeatures, FrozenPrior
 from learner.data.sampling import OrderedRows, Split, draw, order_rows, spread
 from learner.metrics import discrimination
 from learner.settings import AdaptationConfig
-from learner.stages.trainers import BaselineTraining, Load, StageTrainer
+from learner.stages.trainers import BaselineTraining, Load, RowCritic, StageTrainer
 from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import correction_loss
@@ -112,30 +112,24 @@ def corrected_scores(
     return torch.cat([before, before + added], dim=-1)
 
 
-class CorrectedScores:
-    """Where2Act-adaptation."""
-
-    def __init__(self, network: Where2ActAdaptation, prior: FrozenPrior, dataset: Dataset) -> None:
-        self._network, self._prior, self._dataset = network, prior, dataset
-
-    @torch.no_grad()
-    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
-        """s_u + sum (r - s) sim_pq, cut to [0, 1]."""
-        if not len(tries):
-            return self._prior.scores[asked]
-        corrected = corrected_scores(self._network, self._dataset, self._prior, asked[None], tries[None])
-        return corrected[0, :, -1].clamp(0.0, 1.0)
-
-
 def _train(recipe: StageTrainer, config: AdaptationConfig) -> TrainingResult:
     network = recipe.policy.baseline(NAME, Where2ActAdaptation).requires_grad_(True)
     prior = FrozenPrior.of(recipe.policy.prior, recipe.known)
     return recipe.runner.train(AdaptationStage(network, recipe.dataset, recipe.parts, config, prior), config, NAME)
 
 
-def _row_critic(policy: Policy, known: FrozenFeatures) -> CorrectedScores:
-    network = policy.baseline(NAME, Where2ActAdaptation)
-    return CorrectedScores(network, FrozenPrior.of(policy.prior, known), known.dataset)
+def _row_critic(policy: Policy, known: FrozenFeatures) -> RowCritic:
+    network, prior = policy.baseline(NAME, Where2ActAdaptation), FrozenPrior.of(policy.prior, known)
+
+    @torch.no_grad()
+    def scores(asked: Tensor, tries: Tensor) -> Tensor:
+        """s_u + sum (r - s) sim_pq, cut to [0, 1]."""
+        if not len(tries):
+            return prior.scores[asked]
+        corrected = corrected_scores(network, known.dataset, prior, asked[None], tries[None])
+        return corrected[0, :, -1].clamp(0.0, 1.0)
+
+    return scores
 
 
 def _load(config: AdaptationConfig) -> Load:

@@ -13,11 +13,10 @@ from torch import Tensor, nn
 from learner.data.dataset import Dataset
 from learner.data.features import FrozenAap, FrozenFeatures, FrozenPrior
 from learner.data.sampling import Batch, OrderedRows, Split, draw, draw_flips, draw_turns, padded, spread
-from learner.evaluation.critics import AdaptiveScores
 from learner.metrics import discrimination_in_chunks
 from learner.settings import InteractionConfig
 from learner.stages.affordance import AapCritic
-from learner.stages.trainers import BaselineTraining, Load, StageTrainer
+from learner.stages.trainers import BaselineTraining, Load, RowCritic, StageTrainer, adaptive_critic
 from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_loss
@@ -149,8 +148,8 @@ def _train(recipe: StageTrainer, config: InteractionConfig) -> TrainingResult:
     return recipe.runner.train_affordance(affordance, settings, result)
 
 
-def _row_critic(policy: Policy, known: FrozenFeatures) -> AdaptiveScores:
-    return AdaptiveScores(FrozenAap.of(policy.baseline(NAME, Where2ActInteraction), known), known.dataset)
+def _row_critic(policy: Policy, known: FrozenFeatures) -> RowCritic:
+    return adaptive_critic(FrozenAap.of(policy.baseline(NAME, Where2ActInteraction), known))
 
 
 def _load(config: InteractionConfig) -> Load:

@@ -19,7 +19,6 @@ import pytest
 from cluster.cli.main import run as run_command
 from cluster.config.campaign_config import CampaignConfig
 from cluster.evaluation.published import published
-from cluster.evaluation.tables import ResultRow
 from cluster.evaluation.trials import EvaluationTrial, first_trials, most_telling
 from cluster.reporting.clouds import TANGENT, CloudView, draw_panels, tried
 from cluster.reporting.collecting import wilson
@@ -30,6 +29,7 @@ from cluster.reporting.training import after_tries, curves_of, read_entries
 from cluster.reporting.trial_sections import FailedExploit, varied
 from cluster.runs.run_folder import ObjectsUsed, RunFolder, begin
 from cluster.runs.run_log import RunLog
+from learner.evaluation.table import EvaluationRow
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import StoreError
 from shared.plan import EvaluationConfig, Job, ObjectRef, Plan, RolloutRecord, Setting
@@ -157,8 +157,8 @@ def write_trainings(made: RunFolder) -> None:
         (made.training(stage) / name).write_text(text)
 
 
-def row_of(method: str, budget: int, f_score: float | None = 0.5, sample_success: float | None = 0.25) -> ResultRow:
-    return ResultRow(
+def row_of(method: str, budget: int, f_score: float | None = 0.5, sample_success: float | None = 0.25) -> EvaluationRow:
+    return EvaluationRow(
         method=method,
         budget=budget,
         f_score=f_score,

@@ -17,8 +17,8 @@ from collector.setting import packages_used
 from collector.sim.camera import EmbreeCamera, observation_from
 from collector.sim.environment import draw_state
 from collector.sim.scene import Scene
+from collector.sim.simulator import StageClock
 from collector.sim.trial import Trial
-from collector.stopwatch import StageClock
 from collector.worker import Worker
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import ObjectError, UsageError
