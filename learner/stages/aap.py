@@ -200,21 +200,20 @@ class AapStage:
         return SeenRows(self._features[index], rows.xyz[index], frame, *(column[index] for column in told))
 
 
+@dataclass(eq=False)
 class OracleStage:
     """Trains the oracle critic, told the hidden facts outright, on the AAP action scoring loss; not in the paper."""
 
     name = "oracle"
 
-    def __init__(self, critic: OracleCritic, dataset: Dataset, parts: Split, config: AapConfig) -> None:
-        self.module: nn.Module = critic
-        self.critic = critic
-        self.dataset = dataset
-        self.parts = parts
-        self.config = config
+    module: OracleCritic
+    dataset: Dataset
+    parts: Split
+    config: AapConfig
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The oracle and the critic."""
-        return [ParameterGroup(tuple(self.critic.parameters()))]
+        return [ParameterGroup(tuple(self.module.parameters()))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The critic's loss on a few rollouts."""
@@ -225,7 +224,7 @@ class OracleStage:
         mine = share(len(chosen))
         total, ordered = int(ordered.valid.sum()), ordered.select(mine)
         batch = Batch.of(self.dataset, ordered, turns[mine], flips[mine])
-        loss = action_scoring_loss(self.critic.logits(batch), batch.success, ordered.valid)
+        loss = action_scoring_loss(self.module.logits(batch), batch.success, ordered.valid)
         return StepResult({"critic": loss}, total)
 
     @torch.no_grad()
@@ -237,7 +236,7 @@ class OracleStage:
         def judge(chunk: Sequence[int]) -> tuple[ArrayLike, ArrayLike]:
             ordered = order_rows(self.dataset, chunk, self.config.rows_per_rollout, rng)
             batch = Batch.of(self.dataset, ordered)
-            scores = torch.sigmoid(self.critic.logits(batch))[ordered.valid]
+            scores = torch.sigmoid(self.module.logits(batch))[ordered.valid]
             return scores.numpy(force=True), batch.success[ordered.valid].numpy(force=True)
 
         found = discrimination_in_chunks(rollouts, _CHUNK, judge)

@@ -3,9 +3,11 @@
 Shapes: B ordered sets of interactions, n rows of each, K the longest context.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from learner.data.dataset import Dataset
 from learner.data.features import FrozenFeatures, FrozenPrior
@@ -23,6 +25,7 @@ VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 24
 
 
+@dataclass(eq=False)
 class AdaptationStage:
     """Trains the similarities, over a Where2Act that stays as it is (AdaAfford, supplement, Details of Baselines).
 
@@ -32,24 +35,15 @@ class AdaptationStage:
 
     name = NAME
 
-    def __init__(
-        self,
-        network: Where2ActAdaptation,
-        dataset: Dataset,
-        parts: Split,
-        config: AdaptationConfig,
-        prior: FrozenPrior,
-    ) -> None:
-        self.module: nn.Module = network
-        self.network = network
-        self.dataset = dataset
-        self.parts = parts
-        self.config = config
-        self.prior = prior
+    module: Where2ActAdaptation
+    dataset: Dataset
+    parts: Split
+    config: AdaptationConfig
+    prior: FrozenPrior
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The similarity network, at one rate."""
-        return [ParameterGroup(tuple(self.network.parameters()))]
+        return [ParameterGroup(tuple(self.module.parameters()))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The squared error of corrected scores on a few rollouts."""
@@ -66,7 +60,7 @@ class AdaptationStage:
         ordered = order_rows(self.dataset, rollouts, self.config.rows_per_rollout, rng)
         context = ordered.longest_context(self.config.context)
         asked = ordered.asked(context)[:, -1]
-        corrected = corrected_scores(self.network, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
+        corrected = corrected_scores(self.module, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
         success = self.dataset.rows.success[ordered.rows][asked].numpy(force=True)
         before, after = (
             discrimination(corrected[:, :, prefix][asked].clamp(0.0, 1.0).numpy(force=True), success)
@@ -83,7 +77,7 @@ class AdaptationStage:
 
     def _loss(self, ordered: OrderedRows) -> Tensor:
         context = ordered.longest_context(self.config.context)
-        corrected = corrected_scores(self.network, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
+        corrected = corrected_scores(self.module, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
         success = self.dataset.rows.success[ordered.rows]
         # Without an interaction nothing is corrected, and nothing could be learnt.
         return correction_loss(corrected[..., 1:], success[..., None], ordered.asked(context)[:, 1:].transpose(1, 2))
