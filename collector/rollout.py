@@ -19,7 +19,7 @@ from shared.config import DynamicsRanges, Range
 from shared.geometry import camera_pose
 from shared.hidden import ALWAYS_DRAWN
 from shared.plan import ObjectRef, Plan, RolloutRecord, RolloutStatus
-from shared.policies.methods import MethodName, method_named
+from shared.policies.methods import METHODS, MethodName
 from shared.tasks import Task
 from shared.types import (
     Float,
@@ -289,7 +289,7 @@ def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: Proposer
         if not recorder.sound:
             return
         environment.restore(start)
-        method = method_named(name)
+        method = METHODS.get(name)
         version = method.policy_version(plan.policy_version)
         recorder.policy_version = version
         exploiter = make_proposer(method.critic, rng(f"exploit/{name}"), version)
@@ -300,7 +300,7 @@ def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: Proposer
             context = make_proposer(method.tries, rng(f"context/{name}"), version)
         tried[name] = _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), start)
     for name, history in tried.items() if config.exploit_share is not None else ():
-        method = method_named(name)
+        method = METHODS.get(name)
         version = method.policy_version(plan.policy_version)
         recorder.policy_version = version
         if method.draws_tries and recorder.sound:

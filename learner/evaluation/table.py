@@ -22,7 +22,7 @@ from learner.stages.oracle import OracleCritic, Teacher
 from learner.stages.trainers import RowCritic, row_critic
 from shared.errors import StoreError
 from shared.formatting import finite
-from shared.policies.methods import METHODS, CriticName, method_named
+from shared.policies.methods import METHODS, CriticName
 from shared.policies.policy import Policy
 from shared.store.store import Store
 from shared.tasks import TASKS, task_named
@@ -196,7 +196,7 @@ def evaluate_store(
     policies = {version: Policy.from_files(store.read_policy(version))}
     dataset = load_dataset(store, policies[version].config)
     for method in _methods(dataset):
-        used = method_named(method).policy_version(version)
+        used = METHODS.get(method).policy_version(version)
         if used not in policies:
             policies[used] = Policy.from_files(store.read_policy(used))
     return evaluate(dataset, policies, version, budgets, oracle)
@@ -236,7 +236,7 @@ def evaluate(
         told = Teacher.of(oracle, judge.known).scores
         rows.append(judge.row(ORACLE_METHOD, 0, lambda asked, tries: told[asked]))
     for name in _methods(dataset):
-        method = method_named(name)
+        method = METHODS.get(name)
         critic = judge.critic(method.critic, method.policy_version(version))
         rows += [judge.row(name, budget, critic) for budget in method.budgets(budgets)]
     return rows

@@ -26,7 +26,6 @@ from shared.policies.methods import (
     CriticName,
     Method,
     baselines_of,
-    method_named,
     versions_of,
 )
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
@@ -284,7 +283,7 @@ def test_an_unknown_proposer_is_refused_with_those_there_are(adapter: Adapter) -
 
 @pytest.mark.parametrize("name", sorted(METHODS.names()))
 def test_every_method_runs_the_loop(adapter: Adapter, name: str) -> None:
-    method, observation = method_named(name), observation_of()
+    method, observation = METHODS.get(name), observation_of()
     history: list[Interaction] = []
     for budget in method.budgets((4, 1)):
         if method.tries not in (None, "random"):

@@ -24,7 +24,7 @@ from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import ObjectError, UsageError
 from shared.geometry import camera_pose
 from shared.plan import EvaluationConfig, Job, Plan, RolloutRecord, Setting
-from shared.policies.methods import METHODS, method_named
+from shared.policies.methods import METHODS
 from shared.primitives import PRIMITIVES
 from shared.store import Store
 from shared.tasks import TASKS, task_named
@@ -356,7 +356,7 @@ def test_a_depth_image_is_kept_beside_the_same_cloud() -> None:
 
 def test_an_unknown_method_is_refused_with_those_there_are() -> None:
     with pytest.raises(UsageError, match="ours-final"):
-        method_named("ours-fianl")
+        METHODS.get("ours-fianl")
 
 
 @pytest.mark.real_objects
