@@ -21,14 +21,7 @@ from shared.hidden import ALWAYS_DRAWN
 from shared.plan import ObjectRef, Plan, RolloutRecord, RolloutStatus
 from shared.policies.methods import METHODS, MethodName
 from shared.tasks import Task
-from shared.types import (
-    Float,
-    HiddenDynamics,
-    Interaction,
-    Order,
-    Proposer,
-    Role,
-)
+from shared.types import Float, HiddenDynamics, Interaction, Order, Proposer, Role
 
 TRIES = 8
 """Draws of a camera and a state before a rollout is given up as showing nothing that could be acted upon."""

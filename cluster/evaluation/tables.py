@@ -62,7 +62,7 @@ ORDER = (*METHODS.names(), NO_TRIES_METHOD, ORACLE_METHOD)
 
 
 class ResultRows(BaseModel):
-    """What is read of results.json."""
+    """What is read of results.json; see `EvaluationTable`."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 

@@ -1,7 +1,6 @@
 """The results of each method after each number of interactions: table, adaptation curves, main figures."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import plotly.graph_objects as go
@@ -26,23 +25,14 @@ from shared.config import parse
 from shared.formatting import number, percent
 
 
-@dataclass(frozen=True, slots=True)
-class Results:
+class Results(ResultRows):
     """The results of one evaluation.
 
     Attributes:
-        task: what was evaluated.
-        rows: a method and a budget each.
         novel_categories: whether the test objects are of categories that nothing was trained on.
-        objects: how many there were trials of.
-        exploit_share: of a cloud's points, see `shared.plan.EvaluationConfig`.
     """
 
-    task: str
-    rows: tuple[EvaluationRow, ...]
     novel_categories: bool = False
-    objects: int = 0
-    exploit_share: float | None = None
 
     @property
     def budgets(self) -> list[int]:
@@ -90,8 +80,8 @@ def read_results(path: Path, task: str = "", *, novel_categories: bool = False) 
         StoreError: the file is missing or no JSON.
         UsageError: it does not hold results.
     """
-    read = parse(ResultRows, read_json(path), str(path))
-    return Results(read.task or task, read.rows, novel_categories, read.objects, read.exploit_share)
+    read = parse(Results, read_json(path), str(path))
+    return read.model_copy(update={"task": read.task or task, "novel_categories": novel_categories})
 
 
 def results_section(results: Results) -> Section:

@@ -20,14 +20,7 @@ from shared.policies.adaptation import Adapter, action_from_frame, frames_in_vie
 from shared.policies.critics import Critic, critic_named
 from shared.policies.fps import LEAST_POINTS, THRESHOLD, FpsProposer, actionable_points, distances_to
 from shared.policies.imagined_outcomes import ASKED, BEST, CANDIDATES, SURE, USUAL_MOTION
-from shared.policies.methods import (
-    METHODS,
-    BaselineName,
-    CriticName,
-    Method,
-    baselines_of,
-    versions_of,
-)
+from shared.policies.methods import METHODS, BaselineName, CriticName, Method, baselines_of, versions_of
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.policies.proposers import proposer_named
 from shared.policies.where2act_interaction import TRIES, Where2ActInteraction

@@ -28,14 +28,7 @@ from learner.evaluation.curve import (
     tries_by_information,
 )
 from learner.evaluation.table import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
-from learner.settings import (
-    METRICS_FILE,
-    AapConfig,
-    AffordanceConfig,
-    AipConfig,
-    PriorConfig,
-    TrainingConfig,
-)
+from learner.settings import METRICS_FILE, AapConfig, AffordanceConfig, AipConfig, PriorConfig, TrainingConfig
 from learner.stages import jobs
 from learner.stages.aap import AapStage, OracleStage, SeenRows, predict
 from learner.stages.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic
