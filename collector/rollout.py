@@ -228,13 +228,8 @@ def collect(
             break
         assert done, "a state without targets is never used"
         environment.restore(state)
-        if not _next_state(environment, states):
+        if not any(environment.reset(states) and environment.shows_a_target() for _ in range(TRIES)):
             break
-
-
-def _next_state(environment: SimEnvironment, states: np.random.Generator) -> bool:
-    """Draw states until one is at rest and shows a target; whether one was found."""
-    return any(environment.reset(states) and environment.shows_a_target() for _ in range(TRIES))
 
 
 def _record(
