@@ -36,15 +36,7 @@ if TYPE_CHECKING:
     from shared.policies.proposers import AipProposer, ExploitProposer
     from shared.store import Store
     from shared.store.streaming import InteractionDataset
-    from shared.types import (
-        Action,
-        Environment,
-        Interaction,
-        Observation,
-        Outcome,
-        OutcomeKind,
-        Proposer,
-    )
+    from shared.types import Action, Environment, Interaction, Observation, Outcome, OutcomeKind, Proposer
 
     open_store = Store.open
 else:

@@ -83,7 +83,7 @@ class ListingBenchmark:
         content: dict[str, Any] = self._manifest.model_dump(mode="json")
         for number in range(there, size):
             job = self._job(number)
-            folder = self._store.shards_folder / job.shard_id
+            folder = self._store.path / "shards" / job.shard_id
             folder.mkdir(parents=True)
             (folder / MANIFEST_FILE).write_bytes(with_checksum(content | {"start": job.start, "stop": job.stop}))
 

@@ -19,11 +19,11 @@ from benchmarks.script import main
 from cluster.cli.commands.bench import BenchSettings, planned
 from cluster.reporting.collecting import wilson
 from collector.objects.articulation import surface_at
-from collector.objects.cache import ObjectCache
+from collector.objects.catalogue import ObjectCache
 from collector.random_proposer import RandomProposer
 from collector.rollout import Start, begin, object_of
 from collector.sim.armed import ArmedEnvironment
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from shared.arms.arm import Arm
 from shared.arms.kinematics import MAX_JOINT_STEP, chain_of
 from shared.arms.reach import ArmReach, reachable_points

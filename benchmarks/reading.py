@@ -33,7 +33,7 @@ class ReadingSettings(StoredSettings):
 def measure(command: ReadingSettings) -> dict[str, Any]:
     """Measure, and print a table."""
     with stored(command) as store:
-        shards = [store.shards_folder / part.shard.shard_id for part in store.parts()]
+        shards = [store.path / "shards" / part.shard.shard_id for part in store.parts()]
         rows = store.interactions(COLUMNS)
         if not len(rows):
             raise StoreError(f"{store.where}: holds no interaction; collect some first")

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from collector.random_proposer import RandomProposer
-from collector.sim.simulator import SimEnvironment
-from collector.stopwatch import StageClock
+from collector.sim.simulator import SimEnvironment, StageClock
 from shared.geometry import quaternion_from_rotation
 from shared.plan import InteractionRecord
 from shared.primitives import hand_start

@@ -5,33 +5,43 @@ from seeds that are derived from these. So it is the same for every worker and a
 """
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
-from collector.evaluation_rollout import ProposerFactory, evaluate
 from collector.objects.articulation import ArticulatedObject, surface_at
 from collector.random_proposer import RandomProposer
 from collector.recorder import Recorder
 from collector.sim.armed import ArmedEnvironment
-from collector.sim.simulator import SIMULATORS, SimEnvironment
-from collector.stopwatch import StageClock
+from collector.sim.simulator import SIMULATORS, SimEnvironment, StageClock
 from shared import seeds
 from shared.config import DynamicsRanges, Range
 from shared.geometry import camera_pose
 from shared.hidden import ALWAYS_DRAWN
 from shared.plan import ObjectRef, Plan, RolloutRecord, RolloutStatus
+from shared.policies.methods import METHODS, MethodName
 from shared.tasks import Task
-from shared.types import (
-    HiddenDynamics,
-    Order,
-    Proposer,
-    Role,
-)
+from shared.types import Float, HiddenDynamics, Interaction, Order, Proposer, Role
 
 TRIES = 8
 """Draws of a camera and a state before a rollout is given up as showing nothing that could be acted upon."""
 ARM_DISTANCE, ARM_ASIDE, ARM_TURN = (0.3, 0.6), 0.3, 0.2
 """Of the base of an arm: how far before the object's front, and aside of its middle, m, and turned off it, rad."""
+
+
+class ProposerFactory(Protocol):
+    """Makes proposers."""
+
+    def __call__(self, name: str, rng: np.random.Generator, version: int, share: float | None = None, /) -> Proposer:
+        """Make a proposer.
+
+        Args:
+            name: of the proposer, such as "aip".
+            rng: of its random draws.
+            version: of the policy.
+            share: of a cloud's points, from which it draws its points, as far as it draws any; None: its own way.
+        """
+        ...
 
 
 def run_rollout(
@@ -218,13 +228,8 @@ def collect(
             break
         assert done, "a state without targets is never used"
         environment.restore(state)
-        if not _next_state(environment, states):
+        if not any(environment.reset(states) and environment.shows_a_target() for _ in range(TRIES)):
             break
-
-
-def _next_state(environment: SimEnvironment, states: np.random.Generator) -> bool:
-    """Draw states until one is at rest and shows a target; whether one was found."""
-    return any(environment.reset(states) and environment.shows_a_target() for _ in range(TRIES))
 
 
 def _record(
@@ -244,3 +249,93 @@ def _record(
         interactions=tuple(recorder.interactions) if recorder else (),
         arm_base=arm_base,
     )
+
+
+def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: ProposerFactory) -> None:
+    """Run every method of the plan on the environment's present state.
+
+    Args:
+        plan: an evaluation plan.
+        index: number of the rollout.
+        recorder: of the environment, in its start state.
+        make_proposer: makes the proposers that the methods name.
+    """
+    config = plan.setting.evaluation
+    assert config is not None, "an evaluation setting says what to evaluate"
+
+    def rng(purpose: str) -> np.random.Generator:
+        return seeds.generator(plan.setting.seed, f"{purpose}/{plan.key}", index)
+
+    environment = recorder.environment
+    edge_share = plan.setting.terms.edge_share
+    start = environment.state()
+    recorder.interact(RandomProposer(rng("queries"), edge_share), config.queries, Role.QUERY, start=start)
+    if recorder.sound:
+        environment.restore(start)
+    tried: dict[MethodName, list[Interaction]] = {}
+    for name in config.methods:
+        if not recorder.sound:
+            return
+        environment.restore(start)
+        method = METHODS.get(name)
+        version = method.policy_version(plan.policy_version)
+        recorder.policy_version = version
+        exploiter = make_proposer(method.critic, rng(f"exploit/{name}"), version)
+        context: Proposer | None = None
+        if method.tries == RandomProposer.name:
+            context = RandomProposer(rng(f"context/{name}"), edge_share)
+        elif method.tries is not None:
+            context = make_proposer(method.tries, rng(f"context/{name}"), version)
+        tried[name] = _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), start)
+    for name, history in tried.items() if config.exploit_share is not None else ():
+        method = METHODS.get(name)
+        version = method.policy_version(plan.policy_version)
+        recorder.policy_version = version
+        if method.draws_tries and recorder.sound:
+            environment.restore(start)
+            context = make_proposer(str(method.tries), rng(f"context-by-share/{name}"), version, config.exploit_share)
+            most = method.budgets(config.budgets)[-1]
+            history = recorder.interact(context, most, Role.CONTEXT_BY_SHARE, method=name)
+        exploiter = make_proposer(method.critic, rng(f"exploit-by-share/{name}"), version, config.exploit_share)
+        _exploit_by_share(recorder, name, history, exploiter, method.budgets(config.budgets), start)
+
+
+def _exploit_by_share(
+    recorder: Recorder, method: str, tried: list[Interaction], exploiter: Proposer, budgets: list[int], start: Float
+) -> None:
+    """At each budget, execute what the method would do after its first interactions, where they began."""
+    for budget in budgets:
+        if not recorder.sound:
+            return
+        known, role = tried[:budget], Role.EXPLOIT_BY_SHARE
+        recorder.interact(exploiter, 1, role, history=known, start=start, method=method, budget=budget)
+
+
+def _adapt(
+    recorder: Recorder,
+    method: str,
+    context: Proposer | None,
+    exploiter: Proposer,
+    budgets: list[int],
+    start: Float,
+) -> list[Interaction]:
+    """Collect the method's interactions one at a time; at each budget, execute its action and restore the state.
+
+    Returns:
+        The interactions.
+    """
+    environment, history = recorder.environment, list[Interaction]()
+    for budget in budgets:
+        if context is not None:  # A proposer may stop before the greater budgets.
+            left_to_try = budget - len(history)
+            history += recorder.interact(context, left_to_try, Role.CONTEXT, history=history, method=method)
+        if not recorder.sound or not environment.observe().movable.any():
+            return history
+        left = environment.state()
+        # Without interactions, both states are the same.
+        for role, state in ((Role.EXPLOIT, left), (Role.EXPLOIT_AT_START, start))[: 1 if context is None else 2]:
+            recorder.interact(exploiter, 1, role, history=history, start=state, method=method, budget=budget)
+            if not recorder.sound:
+                return history
+        environment.restore(left)
+    return history

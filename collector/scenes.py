@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from collector.objects.articulation import ArticulatedObject
-from collector.objects.cache import ObjectCache
-from collector.objects.catalogue import CatalogueEntry, scan
+from collector.objects.catalogue import CatalogueEntry, ObjectCache, scan
 from collector.sim.raw_scan import random_scan
 from shared import seeds
 from shared.errors import UsageError

@@ -2,11 +2,10 @@
 
 from pathlib import Path
 
-from collector.objects.cache import ObjectCache
-from collector.objects.catalogue import for_task, scan
+from collector.objects.catalogue import ObjectCache, for_task, scan
 from collector.rollout import Start, begin, object_of
 from collector.setting import make_setting
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from shared.config import CollectionConfig
 from shared.errors import UsageError
 from shared.plan import Plan

@@ -14,11 +14,11 @@ import psutil
 
 from collector.job_result import JobResult
 from collector.objects.articulation import ArticulatedObject
-from collector.objects.cache import ObjectCache
+from collector.objects.catalogue import ObjectCache
 from collector.random_proposer import RandomProposer
 from collector.rollout import object_of, quarantined_rollout, run_rollout
 from collector.setting import check_packages
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from collector.watchdog import UnderWay
 from shared.io.redaction import without_places
 from shared.plan import Job, Plan, RolloutRecord, RolloutStatus

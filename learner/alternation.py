@@ -159,7 +159,7 @@ def perform(step: AlternationStep, rollouts: Rollouts, train: Callable[[StageJob
     raise ValueError(f"'{step.name}' is no step of an alternation")
 
 
-class Finished:
+class Finished(Rollouts):
     """`Rollouts` of a store that grows no more; policies stay in their folders.
 
     Where the store holds rollouts that policies proposed, round V of training learns from what versions below V
@@ -182,15 +182,12 @@ class Finished:
         self.at_least = self._newest + 1
 
     def collect(self, step: Collect) -> Mapping[str, Any]:
-        """See `Rollouts.collect`."""
         return {}
 
     def job(self, number: int) -> StageJob:
-        """See `Rollouts.job`."""
         return replace(self._job, newest_policy=number - 1) if 1 <= number <= self._newest else self._job
 
     def publish(self, step: Publish) -> Mapping[str, Any]:
-        """See `Rollouts.publish`."""
         return {}
 
 

@@ -99,7 +99,7 @@ class CameraConfig(StrictModel):
     `run` and `evaluate --policy` then switch it on."""
 
     noise: float = Field(0.0, ge=0, le=MAX_NOISE, exclude_if=lambda noise: noise == 0)
-    """Factor of the errors of a depth camera (`collector.sim.depth_noise`): 0 for none, 1 for a structured-light camera
+    """Factor of the errors of a depth camera (`collector.sim.camera`): 0 for none, 1 for a structured-light camera
     at one metre. Normals are then estimated from what it measured, as those of a robot's scan are."""
 
     @property

@@ -10,8 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from learner.evaluation.comparison import CurveRow
-from learner.evaluation.curve import ProposalGain
+from learner.evaluation.curve import CurveRow, ProposalGain
 from shared.formatting import csv_table, finite, markdown_table, percent
 from shared.io.files import make_folder, write_atomically
 from shared.io.text import markdown

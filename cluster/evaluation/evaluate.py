@@ -78,7 +78,7 @@ class Evaluation:
             worker_group.dismiss()
             told = {"store": self.store.where, "version": self.version, "out": str(self.out), "aap": str(self.oracle)}
             with closing(Child(say, self.root)) as child:
-                child.run("cluster.evaluation.policy_evaluation:write_judgement", told, self.out)
+                child.run("cluster.evaluation.tables:write_judgement", told, self.out)
         return collected
 
     def _publish(self) -> None:

@@ -19,11 +19,10 @@ from adaafford.scans import Scan, ScanFrame, action_at, npz_of
 from adaafford.sessions import Request, Session, Step
 from collector.objects.articulation import Body
 from collector.sim.armed import ArmedEnvironment
-from collector.sim.depth_noise import noisy
+from collector.sim.camera import noisy
 from collector.sim.environment import camera_for
-from collector.sim.raw_scan import raw_scan
+from collector.sim.raw_scan import draw_surroundings, extent, raw_scan
 from collector.sim.simulator import SimEnvironment
-from collector.sim.surroundings import draw_surroundings, extent
 from shared import seeds
 from shared.config import CameraConfig, StrictModel
 from shared.errors import UsageError
@@ -45,7 +44,7 @@ class Setting(StrictModel):
         object: id.
         seed: everything random derives from it.
         number: which of the objects that this seed gives, from 0.
-        noise: see `collector.sim.depth_noise`.
+        noise: see `collector.sim.camera.noisy`.
         marked: whether scans say which points the policy may act on.
         arm: name or file of the arm; None: the hand flies.
         scene: whether scans are raw: with a floor, perhaps walls and other things, and nothing marked.

@@ -1,5 +1,7 @@
 """The table of an evaluation as files: results.json for programs, table.csv for spreadsheets, table.md for people.
 
+`write_judgement` makes it in a process of its own: like a trainer, beside neither Ray nor SAPIEN.
+
 They hold nothing of when, where and by how many workers they were made, so that an evaluation that was killed and run
 again leaves the same bytes.
 """
@@ -9,15 +11,19 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from learner.evaluation.table import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD
-from shared.formatting import csv_table, markdown_table, percent
+from learner.evaluation.table import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD, EvaluationRow, evaluate_store
+from learner.stages.oracle import read_oracle
+from learner.stages.trainers import ORACLE_FILE
+from shared.formatting import csv_table, finite, markdown_table, percent
 from shared.io.files import make_folder, write_atomically
 from shared.io.text import markdown
 from shared.policies.methods import METHODS, MethodName
+from shared.policies.policy import Policy
+from shared.store import Store
 
 RESULTS_FILE, CSV_FILE, MARKDOWN_FILE = "results.json", "table.csv", "table.md"
 
@@ -55,64 +61,15 @@ ORDER = (*METHODS.names(), NO_TRIES_METHOD, ORACLE_METHOD)
 """Of rows: as in the paper's tables, and then what stands beside them."""
 
 
-class ResultRow(BaseModel):
-    """A row of results.json: a method after a budget. See `learner.evaluation.table.EvaluationRow`.
-
-    What older versions did not measure is None in their files.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
-
-    method: str = Field(max_length=100)
-    budget: int
-    f_score: float | None
-    f_score_low: float | None = None
-    f_score_high: float | None = None
-    sample_success: float | None
-    sample_success_low: float | None = None
-    sample_success_high: float | None = None
-    start_success: float | None = None
-    start_success_low: float | None = None
-    start_success_high: float | None = None
-    mix_f_score: float | None = None
-    mix_f_score_low: float | None = None
-    mix_f_score_high: float | None = None
-    shifted_f_score: float | None = None
-    shifted_f_score_low: float | None = None
-    shifted_f_score_high: float | None = None
-    share_success: float | None = None
-    share_success_low: float | None = None
-    share_success_high: float | None = None
-    mix_base_rate: float | None = None
-    trials: int
-    gap_closed: float | None = None
-    best_f: float | None
-    bce: float | None
-    auc: float | None
-    base_rate: float | None
-    queries: int
-    mean_tries: float | None
-
-    def value(self, measure: Measure) -> float | None:
-        """One of the measures."""
-        found: float | None = getattr(self, measure)
-        return found
-
-    def interval(self, measure: Measure) -> tuple[float, float] | None:
-        """The limits of its 95% interval; None where it has none."""
-        low, high = (getattr(self, f"{measure}_{end}") for end in ("low", "high"))
-        return None if low is None or high is None else (low, high)
-
-
 class ResultRows(BaseModel):
-    """What is read of results.json."""
+    """What is read of results.json; see `EvaluationTable`."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     task: str = Field("", max_length=100)
     objects: int = Field(ge=0)
     exploit_share: float | None = None
-    rows: tuple[ResultRow, ...]
+    rows: tuple[EvaluationRow, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +85,7 @@ class EvaluationTable:
         exploit_share: of a cloud's points, see `shared.plan.EvaluationConfig`.
         store_digest: of the interactions that the figures are of.
         contents: of these objects, SHA-256 by id, since runs call other objects the same.
-        rows: a row for each method and budget: the fields of `learner.evaluation.table.EvaluationRow` ("best_f" for
-            short), and "gap_closed", the share of the gap in F-score between Where2Act and the oracle; None: no figure.
+        rows: a row for each method and budget.
     """
 
     task: str
@@ -140,7 +96,7 @@ class EvaluationTable:
     exploit_share: float | None
     store_digest: str
     contents: Mapping[str, str]
-    rows: tuple[Mapping[str, Any], ...]
+    rows: tuple[EvaluationRow, ...]
 
 
 def share_of_gap(low: float, value: float, high: float) -> float:
@@ -151,16 +107,18 @@ def share_of_gap(low: float, value: float, high: float) -> float:
 def write_tables(out: Path, table: EvaluationTable) -> None:
     """Write the three files; results.json comes last, so that where it is, all are."""
     make_folder(out)
-    write_atomically(out / CSV_FILE, csv_table(table.rows, _ONLY_FOR_PROGRAMS).encode())
+    rows = [row.model_dump() for row in table.rows]
+    write_atomically(out / CSV_FILE, csv_table(rows, _ONLY_FOR_PROGRAMS).encode())
     write_atomically(out / MARKDOWN_FILE, as_markdown(table).encode())
-    write_atomically(out / RESULTS_FILE, json.dumps(asdict(table), allow_nan=False).encode())
+    write_atomically(out / RESULTS_FILE, json.dumps(asdict(table) | {"rows": rows}, allow_nan=False).encode())
 
 
 def as_markdown(table: EvaluationTable) -> str:
     """The table as the paper has it, with 95% intervals; percent where the paper has percent."""
-    measured = [name for name in LIKE_FOR_LIKE if any(row[name] is not None for row in table.rows)]
+    measured = [name for name in LIKE_FOR_LIKE if any(row.value(name) is not None for row in table.rows)]
     shown = {name: title for name, title in _SHOWN.items() if name in measured or name not in LIKE_FOR_LIKE}
-    natural, published = (next((row[name] for row in table.rows), None) for name in ("base_rate", "mix_base_rate"))
+    first = next(iter(table.rows), None)
+    natural, published = (None, None) if first is None else (first.base_rate, first.mix_base_rate)
     lines = [
         f"# {markdown(table.task)}",
         "",
@@ -197,10 +155,62 @@ def like_for_like_note(base_rate: float | None, share: float | None) -> str:
     return note
 
 
-def _cell(row: Mapping[str, Any], name: str) -> str:
-    value = row[name]
+def _cell(row: EvaluationRow, name: str) -> str:
+    value: object = getattr(row, name)
     if name in _PERCENT:
-        return percent(value, (row.get(f"{name}_low"), row.get(f"{name}_high")))
+        return percent(row.value(name), row.interval(name) or ())
     if value is None:
         return "-"
     return f"{value:.3g}" if isinstance(value, float) else markdown(value)
+
+
+def write_judgement(store: str, version: int, out: str, aap: str) -> None:
+    """Write the table of the folder `out`.
+
+    Args:
+        store: the evaluation store.
+        version: the policy.
+        out: folder of the table.
+        aap: folder of the training that may have left an oracle; without one the table lacks its row.
+    """
+    write_tables(Path(out), evaluate_policy(Store.open(store), version, Path(aap) / ORACLE_FILE))
+
+
+def evaluate_policy(store: Store, version: int, oracle: Path) -> EvaluationTable:
+    """The table, a row for each method and budget.
+
+    Args:
+        store: the evaluation store.
+        version: the policy.
+        oracle: file of the oracle's weights; where AAP was trained without one, there is none.
+    """
+    config = store.setting.evaluation
+    assert config is not None, "an evaluation store says what was evaluated"
+    network = Policy.from_files(store.read_policy(version)).config
+    told = read_oracle(oracle, network) if oracle.is_file() else None
+    budgets = sorted(config.budgets)
+    rows: list[EvaluationRow] = []
+    for row in evaluate_store(store, version, budgets, told):
+        # The prior knows nothing of tries: all its actions count at every budget, to stand beside the others.
+        alike = budgets if row.method == PRIOR_METHOD else [row.budget]
+        rows += [row.model_copy(update={"budget": budget}) for budget in alike]
+    tried = {name for row in rows if row.counts is not None for name in row.counts.object}
+    return EvaluationTable(
+        task=store.setting.task,
+        seed=store.setting.seed,
+        objects=len(tried),
+        rollouts=sum(part.stop - part.start for part in store.parts()),
+        policy_version=version,
+        exploit_share=config.exploit_share,
+        store_digest=store.digest(),
+        contents={ref.id: ref.content_hash for ref in store.setting.objects if ref.id in tried},
+        rows=tuple(row.model_copy(update={"gap_closed": _gap_closed(row, rows)}) for row in rows),
+    )
+
+
+def _gap_closed(row: EvaluationRow, rows: list[EvaluationRow]) -> float | None:
+    """The share of the gap in F-score between Where2Act and the oracle that a method closes; None without a gap."""
+    bounds = [next((r.f_score for r in rows if r.method == method), None) for method in (PRIOR_METHOD, ORACLE_METHOD)]
+    low, value, high = (math.nan if share is None else share for share in (bounds[0], row.f_score, bounds[1]))
+    closed: float | None = finite(share_of_gap(low, value, high))
+    return closed

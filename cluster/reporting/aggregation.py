@@ -25,14 +25,13 @@ from cluster.evaluation.tables import (
     ORDER,
     RESULTS_FILE,
     WITHOUT_TRIES,
-    ResultRow,
     ResultRows,
     like_for_like_note,
     share_of_gap,
 )
 from cluster.reporting.style import COLOURS, SOFT
 from cluster.runs.run_folder import RunFolder, find, read_json
-from learner.evaluation.table import ORACLE_METHOD, PRIOR_METHOD, ObjectCounts
+from learner.evaluation.table import ORACLE_METHOD, PRIOR_METHOD, EvaluationRow, ObjectCounts
 from shared.config import parse
 from shared.errors import UsageError
 from shared.formatting import csv_table, finite, markdown_table, number, percent
@@ -56,7 +55,7 @@ _COUNTED = tuple(field.name for field in fields(ObjectCounts) if field.name != "
 _ALWAYS_COUNTED = frozenset(field.name for field in fields(ObjectCounts) if field.default is MISSING)
 
 
-class _Row(ResultRow):
+class _Row(EvaluationRow):
     counts: ObjectCounts
 
     @model_validator(mode="after")

@@ -10,15 +10,7 @@ import numpy as np
 
 from cluster.reporting.model_card import CARD_FILE, MAX_TABLE_BYTES, head
 from cluster.runs.warm_start import folder_of
-from learner.calibration import (
-    CalibratedCritic,
-    Calibration,
-    Fit,
-    calibrate,
-    check,
-    critic_rows,
-    together,
-)
+from learner.calibration import CalibratedCritic, Calibration, Fit, calibrate, check, critic_rows, together
 from learner.data.dataset import Dataset, load_dataset
 from learner.stages.jobs import DONE_FILE
 from shared.errors import UsageError

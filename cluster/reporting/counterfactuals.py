@@ -24,7 +24,7 @@ from collector.objects.writing import write_object
 from collector.random_proposer import RepeatingProposer
 from collector.recorder import interact
 from collector.sim.environment import SapienEnvironment
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from shared import seeds
 from shared.config import Range
 from shared.errors import ObjectError

@@ -13,13 +13,7 @@ from learner.alternation import trained_in
 from learner.stages.jobs import DONE_FILE, objects_seen, read_policy_folder
 from shared.config import PANDA, CollectionConfig
 from shared.errors import UsageError
-from shared.io.files import (
-    TEMPORARY_PREFIX,
-    make_folder,
-    read_bounded,
-    write_atomically,
-    writing,
-)
+from shared.io.files import TEMPORARY_PREFIX, make_folder, read_bounded, write_atomically, writing
 from shared.io.text import markdown
 from shared.plan import ObjectRef
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy

@@ -58,8 +58,12 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
         "earlier_software": _earlier_software(run, run_log),
     }
     write_atomically(run.summary, json.dumps(summary, indent=1, allow_nan=False).encode())
-    _draw(run, versions[-1])
-    _write_page(run, config, experiments, say)
+    # Matplotlib and plotly take a while to import, so only here.
+    from cluster.reporting.picture import draw_adaptation
+    from cluster.reporting.writing import write_page
+
+    draw_adaptation(Store.open(run.evaluation), Policy.from_files(store.read_policy(versions[-1])), run.picture)
+    write_page(run, config, experiments=experiments, say=say)
 
 
 def print_report(run: RunFolder) -> None:
@@ -96,21 +100,6 @@ def _speed(run_log: RunLog) -> float | None:
     interactions = sum(tally["interactions"] for tally in tallies)
     seconds = sum(tally["seconds"].get("total", 0.0) for tally in tallies)
     return round(interactions / seconds, 2) if seconds > 0 else None
-
-
-def _draw(run: RunFolder, version: int) -> None:
-    """Draw the picture; matplotlib takes a second to import, so only here."""
-    from cluster.reporting.picture import draw_adaptation
-
-    policy = Policy.from_files(Store.open(run.store).read_policy(version))
-    draw_adaptation(Store.open(run.evaluation), policy, run.picture)
-
-
-def _write_page(run: RunFolder, config: CampaignConfig, experiments: bool, say: Callable[[str], None]) -> None:
-    """Write the page; plotly takes a while to import, so only here."""
-    from cluster.reporting.writing import write_page
-
-    write_page(run, config, experiments=experiments, say=say)
 
 
 def _results_table(summary: dict[str, Any]) -> Table:

@@ -1,7 +1,6 @@
 """The results of each method after each number of interactions: table, adaptation curves, main figures."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import plotly.graph_objects as go
@@ -15,35 +14,25 @@ from cluster.evaluation.tables import (
     ORDER,
     WITHOUT_TRIES,
     Measure,
-    ResultRow,
     ResultRows,
     like_for_like_note,
 )
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
 from cluster.reporting.style import COLOURS, SOFT, laid_out
 from cluster.runs.run_folder import read_json
-from learner.evaluation.table import ORACLE_METHOD, PRIOR_METHOD
+from learner.evaluation.table import ORACLE_METHOD, PRIOR_METHOD, EvaluationRow
 from shared.config import parse
 from shared.formatting import number, percent
 
 
-@dataclass(frozen=True, slots=True)
-class Results:
+class Results(ResultRows):
     """The results of one evaluation.
 
     Attributes:
-        task: what was evaluated.
-        rows: a method and a budget each.
         novel_categories: whether the test objects are of categories that nothing was trained on.
-        objects: how many there were trials of.
-        exploit_share: of a cloud's points, see `shared.plan.EvaluationConfig`.
     """
 
-    task: str
-    rows: tuple[ResultRow, ...]
     novel_categories: bool = False
-    objects: int = 0
-    exploit_share: float | None = None
 
     @property
     def budgets(self) -> list[int]:
@@ -61,7 +50,7 @@ class Results:
         """Whether the paper has figures for the task."""
         return bool(published(self.task, novel_categories=self.novel_categories))
 
-    def row(self, method: str, budget: int) -> ResultRow | None:
+    def row(self, method: str, budget: int) -> EvaluationRow | None:
         """The row of a method at a budget; methods without interactions have a single row."""
         own = [row for row in self.rows if row.method == method]
         exact = next((row for row in own if row.budget == budget), None)
@@ -91,8 +80,8 @@ def read_results(path: Path, task: str = "", *, novel_categories: bool = False) 
         StoreError: the file is missing or no JSON.
         UsageError: it does not hold results.
     """
-    read = parse(ResultRows, read_json(path), str(path))
-    return Results(read.task or task, read.rows, novel_categories, read.objects, read.exploit_share)
+    read = parse(Results, read_json(path), str(path))
+    return read.model_copy(update={"task": read.task or task, "novel_categories": novel_categories})
 
 
 def results_section(results: Results) -> Section:
@@ -178,7 +167,7 @@ def table_of(results: Results, caption: str = "", measures: Mapping[Measure, str
 
 def details_of(results: Results) -> Table:
     """Everything that is known of every row."""
-    names = [name for name in ResultRow.model_fields if name != "method"]
+    names = [name for name in EvaluationRow.model_fields if name not in ("task", "method", "counts")]
     head: Row = (Cell("method", kind="name"), *(Cell(name.replace("_", " ")) for name in names))
     body = tuple(
         (Cell(row.method, kind="name"), *(Cell(number(getattr(row, name))) for name in names)) for row in results.rows
@@ -186,7 +175,7 @@ def details_of(results: Results) -> Table:
     return Table((head,), body, "All figures of all rows", folded=True)
 
 
-def _cell(row: ResultRow | None, measure: Measure, best: float | None) -> Cell:
+def _cell(row: EvaluationRow | None, measure: Measure, best: float | None) -> Cell:
     if row is None or (value := row.value(measure)) is None:
         return Cell("")
     interval = row.interval(measure)

@@ -138,7 +138,8 @@ class Marking:
         """
         if not self.movable.any():
             raise UsageError("no point is marked as movable; click on the part to act on")
-        movable = self.movable if len(self.points) == len(self.scan.points) else self._of_all()
+        all_shown = len(self.points) == len(self.scan.points)
+        movable = self.movable if all_shown else self.movable[self._tree.query(self.scan.points)[1]]
         return replace(self.scan, movable=movable)
 
     def save(self, path: Path, *, overwrite: bool) -> int:
@@ -156,6 +157,3 @@ class Marking:
                 raise UsageError(f"{path}: is there already; start again with another --out, or with --overwrite")
         assert marked.movable is not None
         return int(marked.movable.sum())
-
-    def _of_all(self) -> Mask:
-        return self.movable[self._tree.query(self.scan.points)[1]]

@@ -21,7 +21,7 @@ from cluster.workers.job_queue import JobQueue, PlannedJob
 from cluster.workers.metrics import Cause, WorkerMetrics
 from cluster.workers.retries import Failure, RetryPolicy, RetryQueue, of_environment
 from cluster.workers.slots import Slot, Slots, Task
-from cluster.workers.worker_group import WAIT_S
+from cluster.workers.worker_group import WAIT_S, WorkerGroup
 from collector.actor import WorkerActor
 from collector.job_result import JobResult, WorkerFactory
 from collector.watchdog import Limits
@@ -63,7 +63,7 @@ class Actor(Protocol):
         ...
 
 
-class ProcessActor:
+class ProcessActor(Actor):
     """An `Actor` in a separate process with one CPU; without restarts by Ray, which only repeat `__init__`."""
 
     def __init__(self, make_worker: WorkerFactory, crash_log: CrashLog, limits: Limits) -> None:
@@ -71,17 +71,14 @@ class ProcessActor:
         self._actor = actor.remote(make_worker, crash_log, limits)
 
     def arrive(self) -> "Future[str]":
-        """See `Actor.arrive`."""
         answer: Future[str] = self._actor.arrive.remote().future()
         return answer
 
     def run(self, plan: Any, job: Job, policy: list[Any], quarantined: Mapping[int, str]) -> "Future[JobResult]":
-        """See `Actor.run`."""
         answer: Future[JobResult] = self._actor.run.remote([plan], job, policy, quarantined).future()
         return answer
 
     def end(self) -> None:
-        """See `Actor.end`."""
         ray.kill(self._actor)
 
 
@@ -106,7 +103,7 @@ class _SharedObjects:
         return [self._kept[key][1]] if key in self._kept else []
 
 
-class RayWorkerGroup:
+class RayWorkerGroup(WorkerGroup):
     """Actors of `collector.actor`, one CPU each, alive over all rounds; needs a session (`cluster.workers.session`)."""
 
     def __init__(
@@ -144,7 +141,6 @@ class RayWorkerGroup:
         self._policies.put(version, dict(files))
 
     def run(self, queue: JobQueue, on_result: Callable[[JobResult], None]) -> None:
-        """See `WorkerGroup.run`."""
         retries = RetryPolicy(self.workers)
         backlog = RetryQueue(queue, retries)
         try:
@@ -164,7 +160,6 @@ class RayWorkerGroup:
                     self._dismiss(slot)
 
     def close(self) -> None:
-        """See `WorkerGroup.close`."""
         for slot in self._slots:
             self._dismiss(slot)
 

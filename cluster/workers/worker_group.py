@@ -64,7 +64,7 @@ class WorkerGroup(Protocol):
         ...
 
 
-class SerialWorkerGroup:
+class SerialWorkerGroup(WorkerGroup):
     """One worker in this process, without Ray, for debugging, tests and small machines.
 
     Rollouts that raise are quarantined as usual. One that crashes ends this process, and one that hangs blocks it; a
@@ -80,13 +80,11 @@ class SerialWorkerGroup:
         self._policies: dict[int, Mapping[str, bytes]] = {}
 
     def load_policy(self, version: int, files: Mapping[str, bytes]) -> None:
-        """See `WorkerGroup.load_policy`."""
         self._policies[version] = files
         if self._worker is not None:
             self._worker.load_policy(version, files)
 
     def run(self, queue: JobQueue, on_result: Callable[[JobResult], None]) -> None:
-        """See `WorkerGroup.run`."""
         retries = RetryPolicy()
         backlog = RetryQueue(queue, retries)
         while not backlog.ended:
@@ -99,7 +97,6 @@ class SerialWorkerGroup:
                 on_result(job_result)
 
     def close(self) -> None:
-        """See `WorkerGroup.close`."""
         self._worker = None
 
     def _run(self, planned: PlannedJob, retries: RetryPolicy) -> JobResult | None:

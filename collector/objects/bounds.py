@@ -33,7 +33,8 @@ def check_bounds(bodies: Sequence[Body]) -> None:
     parts = len(bodies) - 1
     if parts > MAX_PARTS:
         raise ObjectError(f"{parts} movable parts; at most {MAX_PARTS} are allowed")
-    pairs = _shape_pairs([len(body.collisions) for body in bodies])
+    shapes = [len(body.collisions) for body in bodies]
+    pairs = (sum(shapes) ** 2 - sum(count * count for count in shapes)) // 2
     if pairs > MAX_SHAPE_PAIRS:
         raise ObjectError(f"{pairs} pairs of collision shapes of different bodies; at most {MAX_SHAPE_PAIRS}")
     depths, origins = [0], [0.0]
@@ -50,10 +51,6 @@ def check_bounds(bodies: Sequence[Body]) -> None:
                 f"link {short(body.link)} can be {reach:.3g} from the root's origin; at most {MAX_REACH:g} is allowed "
                 "(published objects fit into a sphere of radius 1; scale meshes in millimetres by 0.001)"
             )
-
-
-def _shape_pairs(counts: Sequence[int]) -> int:
-    return (sum(counts) ** 2 - sum(count * count for count in counts)) // 2
 
 
 def _offset(joint: Joint) -> float:

@@ -1,10 +1,11 @@
 """The objects of a folder: usable and refused ones, those that suit a task, and their split.
 
-A catalogue keeps a few words an object; geometry is read when it is wanted (`load`).
+A catalogue keeps a few words an object; geometry is read when it is wanted (`load`), and kept in an `ObjectCache`.
 """
 
 import re
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,10 @@ from shared.tasks import Task
 
 MAX_LIST_BYTES = 1 << 20
 OBJECT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+MOST_BYTES = 256 << 20
+"""Of meshes. The published objects take 0.1 to 5 MB each, so that some hundreds find room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,3 +261,40 @@ def _stratified_order(refs: Iterable[ObjectRef], seed: int) -> Sequence[ObjectRe
         by_category.setdefault(ref.category, []).append(ref)
     rng = generator(seed, "object split")
     return [by_category[name][i] for name in sorted(by_category) for i in rng.permutation(len(by_category[name]))]
+
+
+class ObjectCache:
+    """The objects of one folder, read on demand; the least recently used ones are dropped.
+
+    Args:
+        folder: of the objects.
+        most_bytes: of meshes to keep; the last object is kept in any case.
+    """
+
+    def __init__(self, folder: Path, most_bytes: int = MOST_BYTES) -> None:
+        self.folder = folder
+        self._most_bytes = most_bytes
+        self._kept: OrderedDict[tuple[ObjectRef, Collision], ArticulatedObject] = OrderedDict()
+        self._bytes = 0
+
+    def load(self, ref: ObjectRef, collision: Collision) -> ArticulatedObject:
+        """The object of a reference.
+
+        Raises:
+            ObjectError: see `collector.objects.catalogue.load_ref`.
+        """
+        key = ref, collision
+        if key not in self._kept:
+            self._kept[key] = load_ref(self.folder, ref, collision)
+            self._bytes += mesh_bytes(self._kept[key])
+        self._kept.move_to_end(key)
+        while self._bytes > self._most_bytes and len(self._kept) > 1:
+            _, dropped = self._kept.popitem(last=False)
+            self._bytes -= mesh_bytes(dropped)
+        return self._kept[key]
+
+
+def mesh_bytes(target: ArticulatedObject) -> int:
+    """Memory of an object's meshes, each counted once, bytes."""
+    meshes = {id(mesh): mesh for body in target.bodies for mesh in (*body.visuals, *body.collisions)}
+    return sum(mesh.vertices.nbytes + mesh.faces.nbytes for mesh in meshes.values())

@@ -1,14 +1,13 @@
 """A process that decomposes meshes by CoACD, one after another, until its standard input ends.
 
-Each message, either way, is a list of meshes (`collector.objects.mesh_bytes`): one mesh in, its convex pieces out. The
-library cannot be interrupted, and a strange mesh may end its process, so it runs in a separate one.
+Each message, either way, is a list of meshes (`encode`): one mesh in, its convex pieces out. The library cannot be
+interrupted, and a strange mesh may end its process, so it runs in a separate one.
 """
 
 import coacd
 
 from collector.objects.articulation import Mesh
-from collector.objects.child_process import answer_all
-from collector.objects.mesh_bytes import MAX_ENCODED_BYTES, decode, encode
+from collector.objects.child_process import MAX_ENCODED_BYTES, answer_all, decode, encode
 
 MAX_PIECES = 16
 """Of one mesh."""

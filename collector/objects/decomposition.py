@@ -17,9 +17,8 @@ import numpy as np
 
 from collector.objects.articulation import ArticulatedObject, Body, Mesh
 from collector.objects.bounds import check_bounds
-from collector.objects.child_process import ChildProcess
+from collector.objects.child_process import MAX_ENCODED_BYTES, ChildProcess, decode, encode
 from collector.objects.coacd_process import MAX_PIECES, SETTINGS
-from collector.objects.mesh_bytes import MAX_ENCODED_BYTES, decode, encode
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.io.files import read_bounded, remove_tree, write_atomically
 

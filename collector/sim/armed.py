@@ -5,16 +5,15 @@ from dataclasses import replace
 import numpy as np
 
 from collector.objects.articulation import surface_at
-from collector.sim.simulator import PrivilegedState, SimEnvironment
-from collector.stopwatch import StageClock
+from collector.sim.simulator import PrivilegedState, SimEnvironment, StageClock
 from shared.arms.arm import Arm
 from shared.arms.reach import ArmReach
 from shared.primitives import PRIMITIVES
 from shared.types import Action, Float, Observation, Outcome, OutcomeKind
 
 
-class ArmedEnvironment:
-    """Implements `collector.sim.simulator.SimEnvironment` around one of any simulator.
+class ArmedEnvironment(SimEnvironment):
+    """An environment of any simulator, behind an arm.
 
     Args:
         environment: executes what is reached, by a hand that flies as the arm would carry it.
@@ -59,21 +58,16 @@ class ArmedEnvironment:
         return self._told[id(observed)]
 
     def reset(self, rng: np.random.Generator) -> bool:
-        """See `SimEnvironment.reset`."""
         return self._environment.reset(rng)
 
     def shows_a_target(self) -> bool:
-        """See `SimEnvironment.shows_a_target`."""
         return self._environment.shows_a_target()
 
     def state(self) -> Float:
-        """See `SimEnvironment.state`."""
         return self._environment.state()
 
     def restore(self, state: Float) -> None:
-        """See `SimEnvironment.restore`."""
         self._environment.restore(state)
 
     def privileged(self, part: int) -> PrivilegedState:
-        """See `SimEnvironment.privileged`."""
         return self._environment.privileged(part)

@@ -6,13 +6,11 @@ import numpy as np
 
 from collector.objects.articulation import ArticulatedObject, joint_twist
 from collector.objects.catalogue import qualifying_parts
-from collector.sim.camera import Camera, EmbreeCamera, observation_from
-from collector.sim.depth_noise import noisy
+from collector.sim.camera import Camera, EmbreeCamera, noisy, observation_from
 from collector.sim.sapien_camera import SapienCamera
 from collector.sim.scene import Scene
-from collector.sim.simulator import PrivilegedState, SimEnvironment
+from collector.sim.simulator import PrivilegedState, SimEnvironment, StageClock
 from collector.sim.trial import Trial
-from collector.stopwatch import StageClock
 from shared.config import CameraConfig, CollectionConfig
 from shared.errors import UsageError
 from shared.primitives import PRIMITIVES

@@ -196,7 +196,7 @@ class TwoFingers:
         return link
 
 
-class FreeGripper:
+class FreeGripper(Gripper):
     """A hand whose palm is a free body, moved to its target by one drive with six degrees of freedom.
 
     Args:
@@ -219,7 +219,6 @@ class FreeGripper:
         self._target = sapien.Pose()
 
     def set_pace(self, pace: float) -> None:
-        """See `Gripper.set_pace`."""
         if pace == self._pace:
             return
         self._pace = pace
@@ -233,7 +232,6 @@ class FreeGripper:
         set_finger_pace(self._finger_joints, pace)
 
     def place(self, rotation: Float, position: Float, *, opened: bool) -> None:
-        """See `Gripper.place`."""
         self._rotation, self._origin = rotation, position
         self._drive.pose_in_parent = at = pose(frame(rotation, position))
         self.drive(still())
@@ -243,7 +241,6 @@ class FreeGripper:
         self._fly(at, np.zeros(3), np.zeros(3))
 
     def shift(self, place: Float, velocity: Float) -> None:
-        """See `Gripper.shift`."""
         turned = self._rotation @ rotation_about_z(place[3]) if place[3] else self._rotation
         at = pose(frame(turned, self._origin + self._rotation @ place[:3]))
         self._fly(at, self._rotation @ velocity[:3], self._rotation[:, 2] * velocity[3])
@@ -256,11 +253,9 @@ class FreeGripper:
         self._articulation.set_qvel(self._still)
 
     def displacement(self) -> Float:
-        """See `Gripper.displacement`."""
         return np.asarray((self._articulation.get_root_pose().p - self._origin) @ self._rotation, dtype=np.float64)
 
     def drive(self, place: Float) -> None:
-        """See `Gripper.drive`."""
         if half := place[3] / 2:
             self._drive.set_drive_target(sapien.Pose(place[:3], [np.cos(half), 0.0, 0.0, np.sin(half)]))
         else:
@@ -269,19 +264,15 @@ class FreeGripper:
             self._drive.set_drive_target(self._target)
 
     def drive_velocity(self, velocity: Float) -> None:
-        """See `Gripper.drive_velocity`."""
         self._drive.set_drive_velocity_target(velocity[:3], [0.0, 0.0, velocity[3]])
 
     def close(self) -> None:
-        """See `Gripper.close`."""
         drive_fingers(self._finger_joints, 0.0)
 
     def opening(self) -> float:
-        """See `Gripper.opening`."""
         return float(self._articulation.get_qpos().sum())
 
     def holds(self) -> bool:
-        """See `Gripper.holds`."""
         return self.opening() > GRASP_OPENING
 
     def attached(self) -> bool:

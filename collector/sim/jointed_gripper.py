@@ -11,6 +11,7 @@ from collector.sim.gripper import (
     ARM_DAMPING,
     ARM_STIFFNESS,
     GRASP_OPENING,
+    Gripper,
     HandShape,
     drive_fingers,
     frame,
@@ -25,7 +26,7 @@ DRIVEN = (0, 1, 2, 5)
 """The joints that move the hand along its axes, and turn it about up."""
 
 
-class JointedGripper:
+class JointedGripper(Gripper):
     """A hand whose pose is a joint position.
 
     Args:
@@ -50,13 +51,11 @@ class JointedGripper:
         assert all(j.name.startswith("finger-") for j in self.joints[6:]), "joint order is by creation"
 
     def set_pace(self, pace: float) -> None:
-        """See `Gripper.set_pace`."""
         for joint in self.joints[:6]:
             joint.set_drive_property(ARM_STIFFNESS, ARM_DAMPING / pace)
         set_finger_pace(self.joints[6:], pace)
 
     def place(self, rotation: Float, position: Float, *, opened: bool) -> None:
-        """See `Gripper.place`."""
         self.articulation.set_root_pose(pose(frame(rotation, position)))
         positions = np.array([0.0] * 6 + [self._open if opened else 0.0] * (len(self.joints) - 6), dtype=np.float32)
         self.articulation.set_qpos(positions)
@@ -66,7 +65,6 @@ class JointedGripper:
             joint.set_drive_velocity_target(0.0)
 
     def shift(self, place: Float, velocity: Float) -> None:
-        """See `Gripper.shift`."""
         positions = self.articulation.get_qpos()
         velocities = np.zeros_like(positions)
         positions[:6] = on_arm(place)
@@ -75,29 +73,23 @@ class JointedGripper:
         self.articulation.set_qvel(velocities)
 
     def displacement(self) -> Float:
-        """See `Gripper.displacement`."""
         return np.asarray(self.articulation.get_qpos()[:3], dtype=np.float64)
 
     def drive(self, place: Float) -> None:
-        """See `Gripper.drive`."""
         for joint, target in zip(self._driven, place, strict=True):
             joint.set_drive_target(target)
 
     def drive_velocity(self, velocity: Float) -> None:
-        """See `Gripper.drive_velocity`."""
         for joint, target in zip(self._driven, velocity, strict=True):
             joint.set_drive_velocity_target(target)
 
     def close(self) -> None:
-        """See `Gripper.close`."""
         drive_fingers(self.joints[6:], 0.0)
 
     def opening(self) -> float:
-        """See `Gripper.opening`."""
         return float(self.articulation.get_qpos()[6:].sum())
 
     def holds(self) -> bool:
-        """See `Gripper.holds`."""
         return self.opening() > GRASP_OPENING
 
     def attached(self) -> bool:

@@ -1,16 +1,42 @@
 """The interface between a rollout and a simulator, and the registry of simulators."""
 
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from collector.objects.articulation import ArticulatedObject
-from collector.stopwatch import StageClock
 from shared.config import SAPIEN, CollectionConfig
 from shared.extensions import Registry
 from shared.tasks import Task
 from shared.types import Environment, Float, HiddenDynamics
+
+
+class StageClock:
+    """Sums wall time by stage.
+
+    Example:
+        clock = StageClock()
+        with clock.stage("simulate"):
+            ...
+        clock.seconds["simulate"]
+    """
+
+    def __init__(self) -> None:
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the duration of the block to a stage."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] += time.perf_counter() - begun
 
 
 @dataclass(frozen=True, slots=True)

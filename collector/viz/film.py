@@ -12,7 +12,7 @@ from collector.random_proposer import RandomProposer
 from collector.recorder import interact
 from collector.sim.environment import SapienEnvironment
 from collector.sim.grippers import GRIPPERS
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from collector.viz.playback import Playback, RecordedTrial, caption
 from collector.viz.preview import save
 from collector.viz.rendering import Picture, Renderer, View, with_most_of_the_hand

@@ -1,6 +1,6 @@
 """The adaptation curve: what critics know of stored rollouts after 0, 1, 2, ... interactions.
 
-Where2Act and the oracle are its bounds.
+Where2Act and the oracle are its bounds. Curves of several trainings are pooled over their seeds.
 
 Offline: half of a rollout's own rows are candidates for interactions, the other half are the questions. The questions
 are the same for all critics and after every number of interactions, so that two figures differ by critic and
@@ -10,7 +10,7 @@ Shapes: R rollouts times draws, n rows of each (padded), c candidates of each, K
 all.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,9 +22,8 @@ from torch import Tensor
 from learner.data.dataset import Dataset
 from learner.data.features import FrozenAap, FrozenFeatures, FrozenPrior
 from learner.data.sampling import OrderedRows, order_rows
-from learner.evaluation.critics import OracleScores
-from learner.metrics import correlation
-from learner.stages.oracle import OracleCritic
+from learner.metrics import THRESHOLD, correlation, cross_entropies, discrimination, f_score_interval, ratio_interval
+from learner.stages.oracle import OracleCritic, Teacher
 from learner.training.losses import action_scoring_losses
 from shared.networks.aip import Aip
 from shared.networks.prior import Prior
@@ -127,9 +126,9 @@ def answer(
     for critic, made in chosen.items():
         latents = frozen.latents(made)
         for number in tries:
-            scores[Asked(critic, number)] = _scores(dataset, ordered.rows, frozen, latents[:, number])[asked]
+            scores[Asked(critic, number)] = _scores(ordered.rows, frozen, latents[:, number])[asked]
     if oracle is not None:
-        scores[Asked("oracle", 0)] = OracleScores(oracle, known)(index, torch.zeros(0, dtype=torch.long))
+        scores[Asked("oracle", 0)] = Teacher.of(oracle, known).scores[index]
     return Answers(
         labels=dataset.rows.success[index].numpy(force=True) > 0.5,
         objects=owner.repeat(asked.sum(dim=1).numpy()),
@@ -150,28 +149,30 @@ def tries_by_aip(known: FrozenFeatures, candidates: Tensor, frozen: FrozenAap, a
     """
     rows, features = known.dataset.rows, known.rows(aip.encoder)[candidates]
     xyz, frames = rows.xyz[candidates], rows.frame[candidates]
-    made = candidates[:, :0]
-    free = torch.ones(candidates.shape, dtype=torch.bool)
+
+    def gains(made: Tensor, latents: Tensor) -> Tensor:
+        believed = torch.sigmoid(frozen.logits(candidates, latents))
+        return aip.action_scores(features, xyz, frames, latents, believed)
+
+    return _one_by_one(candidates, frozen, most, gains)
+
+
+def _one_by_one(candidates: Tensor, frozen: FrozenAap, most: int, worth: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """The candidates, each once, that are worth most after those before, by their rows and z; [R, most]."""
+    free, made = torch.ones(candidates.shape, dtype=torch.bool), candidates[:, :0]
     for _ in range(most):
-        latents = frozen.latents(made)[:, -1:]
-        believed = torch.sigmoid(frozen.aap.action_logits(frozen.features[candidates], xyz, frames, latents))
-        gains = aip.action_scores(features, xyz, frames, latents, believed)
-        best = torch.where(free, gains, -torch.inf).argmax(dim=1, keepdim=True)
+        found = worth(made, frozen.latents(made)[:, -1:])
+        best = torch.where(free, found, -torch.inf).argmax(dim=1, keepdim=True)
         free.scatter_(1, best, False)
         made = torch.cat([made, candidates.gather(1, best)], dim=1)
     return made
 
 
 @torch.no_grad()
-def _scores(dataset: Dataset, index: Tensor, frozen: FrozenAap, latents: Tensor) -> Tensor:
+def _scores(index: Tensor, frozen: FrozenAap, latents: Tensor) -> Tensor:
     """AAP's scores of rows, [R, n], after z, [R, latent_width]; in chunks, to bound memory."""
-    chunks = []
-    for start in range(0, len(index), _CHUNK):
-        part = index[start : start + _CHUNK]
-        xyz, frames = dataset.rows.xyz[part], dataset.rows.frame[part]
-        z = latents[start : start + _CHUNK, None]
-        chunks.append(torch.sigmoid(frozen.aap.action_logits(frozen.features[part], xyz, frames, z)))
-    return torch.cat(chunks)
+    chunks = (slice(start, start + _CHUNK) for start in range(0, len(index), _CHUNK))
+    return torch.cat([torch.sigmoid(frozen.logits(index[here], latents[here, None])) for here in chunks])
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,13 +236,8 @@ def _gains_of(
     latent = frozen.latents(made[None])[0, -1]
     latents = torch.cat([latent[None], frozen.latents(several)[:, -1]])
     data = dataset.rows
-    logits = frozen.aap.action_logits(
-        frozen.features[questions], data.xyz[questions], data.frame[questions], latents[:, None]
-    )
-    losses = action_scoring_losses(logits, data.success[questions]).mean(dim=1)
-    believed = torch.sigmoid(
-        frozen.aap.action_logits(frozen.features[candidates], data.xyz[candidates], data.frame[candidates], latent)
-    )
+    losses = action_scoring_losses(frozen.logits(questions, latents[:, None]), data.success[questions]).mean(dim=1)
+    believed = torch.sigmoid(frozen.logits(candidates, latent))
     scores = aip.action_scores(features[candidates], data.xyz[candidates], data.frame[candidates], latent, believed)
     return (losses[0] - losses[1:]).numpy(force=True), scores.numpy(force=True), float(losses[0])
 
@@ -269,12 +265,120 @@ def tries_by_information(candidates: Tensor, frozen: FrozenAap, most: int) -> Te
 
 def _choose(candidates: Tensor, frozen: FrozenAap, most: int) -> Tensor:
     imagined = [frozen.imagined(candidates, success) for success in (False, True)]
-    free = torch.ones(candidates.shape, dtype=torch.bool)
-    made = candidates[:, :0]
-    for _ in range(most):
-        latents = frozen.latents(made)[:, -1:]
-        expected = frozen.expected_divergence(candidates, made, latents, imagined)[1].mean(dim=-1)
-        best = torch.where(free, expected, -torch.inf).argmax(dim=1, keepdim=True)
-        free.scatter_(1, best, False)
-        made = torch.cat([made, candidates.gather(1, best)], dim=1)
-    return made
+
+    def expected(made: Tensor, latents: Tensor) -> Tensor:
+        return frozen.expected_divergence(candidates, made, latents, imagined)[1].mean(dim=-1)
+
+    return _one_by_one(candidates, frozen, most, expected)
+
+
+_PRIOR, _NO_TRIES, _ORACLE = Asked("where2act", 0), Asked("random", 0), Asked("oracle", 0)
+
+
+@dataclass(frozen=True, slots=True)
+class CurveRow:
+    """One critic after some interactions; NaN where a figure is not defined.
+
+    Attributes:
+        name: of the training.
+        run: the place of its run among those of the name, from "1"; "" for all of them together.
+        critic: whose answers, and how its interactions were chosen.
+        tries: how many.
+        f_score: at the threshold 0.5, with its 95% interval over objects.
+        best_f_score: at the threshold best in hindsight.
+        bce: binary cross entropy, nats.
+        auc: area under the ROC curve.
+        calibration_error: ECE.
+        base_rate: share of successes among the questions.
+        questions: how many; a run's draws of interactions and questions from one rollout all count.
+        objects: how many they are about.
+        closed: share of the gap in cross entropy between Where2Act and the oracle, with its 95% interval over objects.
+        closed_from_none: the same of the gap between AAP without interactions, a second prior, and the oracle.
+    """
+
+    name: str
+    run: str
+    critic: CriticKind
+    tries: int
+    f_score: float
+    f_score_low: float
+    f_score_high: float
+    best_f_score: float
+    bce: float
+    auc: float
+    calibration_error: float
+    base_rate: float
+    questions: int
+    objects: int
+    closed: float
+    closed_low: float
+    closed_high: float
+    closed_from_none: float
+
+
+def curve_rows(name: str, runs: Sequence[tuple[str, Answers]]) -> list[CurveRow]:
+    """Rows of a training: those of all its runs together first, then of each.
+
+    Args:
+        name: of the training.
+        runs: each run's name and what its critics answered; all to the same critics and numbers of interactions.
+    """
+    pooled = rows_of(name, "", [answers for _, answers in runs])
+    return pooled + [row for run, answers in runs for row in rows_of(name, run, [answers])]
+
+
+def rows_of(name: str, run: str, answers: Sequence[Answers]) -> list[CurveRow]:
+    """A row for each critic and number of interactions."""
+    labels = np.concatenate([found.labels for found in answers])
+    _, groups = np.unique(np.concatenate([found.objects for found in answers]), return_inverse=True)
+    scores = {
+        asked: np.concatenate([found.scores[asked] for found in answers]).astype(np.float64)
+        for asked in answers[0].scores
+    }
+    losses = {asked: cross_entropies(found, labels) for asked, found in scores.items()}
+    return [_row(name, run, asked, scores[asked], losses, labels, groups) for asked in scores]
+
+
+def _row(
+    name: str,
+    run: str,
+    asked: Asked,
+    scores: NDArray[np.float64],
+    losses: dict[Asked, NDArray[np.float64]],
+    labels: NDArray[np.bool_],
+    groups: NDArray[np.int64],
+) -> CurveRow:
+    found = discrimination(scores, labels)
+    f_low, f_high = f_score_interval(scores >= THRESHOLD, labels, groups)
+    closed, closed_low, closed_high, from_none = (float("nan"),) * 4
+    if _ORACLE in losses:
+        gained, whole = losses[_PRIOR] - losses[asked], losses[_PRIOR] - losses[_ORACLE]
+        closed = share(gained, whole)
+        closed_low, closed_high = ratio_interval(gained, whole, groups)
+        from_none = share(losses[_NO_TRIES] - losses[asked], losses[_NO_TRIES] - losses[_ORACLE])
+    return CurveRow(
+        name=name,
+        run=run,
+        critic=asked.critic,
+        tries=asked.tries,
+        f_score=found.f_score,
+        f_score_low=f_low,
+        f_score_high=f_high,
+        best_f_score=found.best_f_score,
+        bce=found.bce,
+        auc=found.auc,
+        calibration_error=found.calibration_error,
+        base_rate=found.base_rate,
+        questions=found.rows,
+        objects=len(np.unique(groups)),
+        closed=closed,
+        closed_low=closed_low,
+        closed_high=closed_high,
+        closed_from_none=from_none,
+    )
+
+
+def share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> float:
+    """Sum of a part over the sum of the whole; NaN where there is no gap to close."""
+    gap = float(whole.sum())
+    return float(part.sum()) / gap if gap > 0 else float("nan")

@@ -11,17 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import FrozenFeatures
-from learner.evaluation.critics import OracleScores, row_critic
 from learner.evaluation.published_mix import mix_for, shifted_threshold
 from learner.metrics import THRESHOLD, discrimination, ratio_interval
-from learner.stages.oracle import OracleCritic
-from learner.stages.trainers import RowCritic
+from learner.stages.oracle import OracleCritic, Teacher
+from learner.stages.trainers import RowCritic, row_critic
 from shared.errors import StoreError
-from shared.policies.methods import METHODS, CriticName, method_named
+from shared.formatting import finite
+from shared.policies.methods import METHODS, CriticName
 from shared.policies.policy import Policy
 from shared.store.store import Store
 from shared.tasks import TASKS, task_named
@@ -111,18 +112,18 @@ class ObjectCounts:
         return found
 
 
-@dataclass(frozen=True, slots=True)
-class EvaluationRow:
-    """One method after one budget of interactions, on all rollouts together; NaN where there was nothing to measure.
+class EvaluationRow(BaseModel):
+    """One method after one budget of interactions, on all rollouts together; a row of results.json.
 
-    Names that end in `_low` and `_high` are the limits of the figure's 95% interval over objects.
+    A figure is None where there was nothing to measure, or where an older version did not measure it. Names that end in
+    `_low` and `_high` are the limits of the figure's 95% interval over objects.
 
     Attributes:
         task: what was evaluated.
         method: whose interactions.
         budget: how many interactions a rollout, at the most.
         f_score: of the critic on the QUERY rows at the threshold 0.5.
-        best_f_score: at the threshold best in hindsight.
+        best_f: the F-score at the threshold best in hindsight.
         bce: binary cross entropy, nats.
         auc: area under the ROC curve.
         base_rate: share of successes among the QUERY rows.
@@ -136,38 +137,52 @@ class EvaluationRow:
         share_success: share of the EXPLOIT_BY_SHARE rows that succeeded.
         mix_base_rate: share of successes in the published mix of rows.
         counts: what these are of, by object.
+        gap_closed: the share of the gap in F-score between Where2Act and the oracle.
     """
 
-    task: str
-    method: str
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    task: str = Field("", max_length=100)
+    method: str = Field(max_length=100)
     budget: int
-    f_score: float
-    best_f_score: float
-    bce: float
-    auc: float
-    base_rate: float
+    f_score: float | None
+    best_f: float | None
+    bce: float | None
+    auc: float | None
+    base_rate: float | None
     queries: int
-    sample_success: float
-    start_success: float
+    sample_success: float | None
+    start_success: float | None = None
     trials: int
-    mean_tries: float
-    f_score_low: float
-    f_score_high: float
-    sample_success_low: float
-    sample_success_high: float
-    start_success_low: float
-    start_success_high: float
-    mix_f_score: float
-    mix_f_score_low: float
-    mix_f_score_high: float
-    shifted_f_score: float
-    shifted_f_score_low: float
-    shifted_f_score_high: float
-    share_success: float
-    share_success_low: float
-    share_success_high: float
-    mix_base_rate: float
-    counts: ObjectCounts
+    mean_tries: float | None
+    f_score_low: float | None = None
+    f_score_high: float | None = None
+    sample_success_low: float | None = None
+    sample_success_high: float | None = None
+    start_success_low: float | None = None
+    start_success_high: float | None = None
+    mix_f_score: float | None = None
+    mix_f_score_low: float | None = None
+    mix_f_score_high: float | None = None
+    shifted_f_score: float | None = None
+    shifted_f_score_low: float | None = None
+    shifted_f_score_high: float | None = None
+    share_success: float | None = None
+    share_success_low: float | None = None
+    share_success_high: float | None = None
+    mix_base_rate: float | None = None
+    counts: ObjectCounts | None = None
+    gap_closed: float | None = None
+
+    def value(self, measure: str) -> float | None:
+        """One of the figures."""
+        found: float | None = getattr(self, measure)
+        return found
+
+    def interval(self, measure: str) -> tuple[float, float] | None:
+        """The limits of its 95% interval; None where it has none."""
+        low, high = (getattr(self, f"{measure}_{end}", None) for end in ("low", "high"))
+        return None if low is None or high is None else (low, high)
 
 
 def evaluate_store(
@@ -181,7 +196,7 @@ def evaluate_store(
     policies = {version: Policy.from_files(store.read_policy(version))}
     dataset = load_dataset(store, policies[version].config)
     for method in _methods(dataset):
-        used = method_named(method).policy_version(version)
+        used = METHODS.get(method).policy_version(version)
         if used not in policies:
             policies[used] = Policy.from_files(store.read_policy(used))
     return evaluate(dataset, policies, version, budgets, oracle)
@@ -218,9 +233,10 @@ def evaluate(
     if "aap" in policies[version].trained:
         rows.append(judge.row(NO_TRIES_METHOD, 0, judge.critic("aap", version)))
     if oracle is not None:
-        rows.append(judge.row(ORACLE_METHOD, 0, OracleScores(oracle.eval(), judge.known)))
+        told = Teacher.of(oracle, judge.known).scores
+        rows.append(judge.row(ORACLE_METHOD, 0, lambda asked, tries: told[asked]))
     for name in _methods(dataset):
-        method = method_named(name)
+        method = METHODS.get(name)
         critic = judge.critic(method.critic, method.policy_version(version))
         rows += [judge.row(name, budget, critic) for budget in method.budgets(budgets)]
     return rows
@@ -283,21 +299,17 @@ class _Judge:
         found = discrimination(believed, self._true)
         shifted = believed >= shifted_threshold(found.base_rate, self._mix_base_rate)
         counts = self._counts(method, budget, believed >= THRESHOLD, shifted)
-        return EvaluationRow(
-            task=self.dataset.task,
-            method=method,
-            budget=budget,
-            best_f_score=found.best_f_score,
-            bce=found.bce,
-            auc=found.auc,
-            base_rate=found.base_rate,
-            queries=found.rows,
-            trials=sum(counts.trials),
-            mean_tries=float(np.mean([len(context) for _, context in pairs])),
-            mix_base_rate=self._mix_base_rate,
-            counts=counts,
+        figures = {
+            "best_f": found.best_f_score,
+            "bce": found.bce,
+            "auc": found.auc,
+            "base_rate": found.base_rate,
+            "mean_tries": float(np.mean([len(context) for _, context in pairs])),
+            "mix_base_rate": self._mix_base_rate,
             **counts.shares(),
-        )
+        }
+        numbers = {"budget": budget, "queries": found.rows, "trials": sum(counts.trials)}
+        return EvaluationRow(task=self.dataset.task, method=method, counts=counts, **numbers, **finite(figures))
 
     def _counts(
         self,

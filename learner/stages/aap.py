@@ -78,19 +78,6 @@ class SeenRows:
         return cls(features, batch.xyz, batch.frame, batch.motion, batch.success, batch.details)
 
 
-@dataclass(frozen=True, slots=True)
-class PrefixPrediction:
-    """What AAP makes of ordered rows after every prefix of their context.
-
-    Attributes:
-        logits: of the action scores, [B, K + 1, n].
-        latents: z of the prefixes, [B, K + 1, latent_width].
-    """
-
-    logits: Tensor
-    latents: Tensor
-
-
 class AapStage:
     """Trains all of `Aap` but D (AdaAfford, AAP Action Scoring Loss).
 
@@ -165,15 +152,15 @@ class AapStage:
             # Drawn for all rollouts of the step, so that several processes draw alike.
             unknown = torch.as_tensor(rng.random((2, len(rollouts), 1)) < config.unknown_details)[:, mine]
             seen = replace(seen, details=without_details(seen.details, *unknown))
-        prediction = predict(self.aap, seen, context)
+        logits, latents = predict(self.aap, seen, context)
         asked = ordered.asked(context)
-        losses = {"critic": action_scoring_loss(prediction.logits, seen.success[:, None], asked)}
+        losses = {"critic": action_scoring_loss(logits, seen.success[:, None], asked)}
         if self._teacher is not None:
             surer = self._teacher.scores[ordered.rows][:, None]
             # Interactions are on one part, so that what is hidden, and its z, differ between states at the most.
             told = self._teacher.latents[ordered.rows[:, 0]]
-            losses["imitation"] = config.imitation * action_scoring_loss(prediction.logits, surer, asked)
-            losses["distillation"] = config.distillation * distillation_loss(prediction.latents, told, asked.any(-1))
+            losses["imitation"] = config.imitation * action_scoring_loss(logits, surer, asked)
+            losses["distillation"] = config.distillation * distillation_loss(latents, told, asked.any(-1))
         return StepResult(losses, total)
 
     @torch.no_grad()
@@ -189,12 +176,12 @@ class AapStage:
             ordered = order_rows(self.dataset, chunk, config.rows_per_rollout, rng, config.continued_first)
             context = ordered.longest_context(self.config.context)
             seen = self._see(ordered)
-            prediction = predict(self.aap, seen, context)
+            logits, _ = predict(self.aap, seen, context)
             success, asked = seen.success, ordered.asked(context)
-            losses.append(action_scoring_loss(prediction.logits, success[:, None], asked))
+            losses.append(action_scoring_loss(logits, success[:, None], asked))
             asked_last = asked[:, -1]
             for tries, kept in scores.items():
-                kept.append(torch.sigmoid(prediction.logits[:, min(tries, context)][asked_last]))
+                kept.append(torch.sigmoid(logits[:, min(tries, context)][asked_last]))
             labels.append(success[asked_last])
         known = torch.cat(labels).numpy(force=True)
         figures = {"score": float(torch.stack(losses).mean()), "base_rate": float(known.mean())}
@@ -213,21 +200,20 @@ class AapStage:
         return SeenRows(self._features[index], rows.xyz[index], frame, *(column[index] for column in told))
 
 
+@dataclass(eq=False)
 class OracleStage:
     """Trains the oracle critic, told the hidden facts outright, on the AAP action scoring loss; not in the paper."""
 
     name = "oracle"
 
-    def __init__(self, critic: OracleCritic, dataset: Dataset, parts: Split, config: AapConfig) -> None:
-        self.module: nn.Module = critic
-        self.critic = critic
-        self.dataset = dataset
-        self.parts = parts
-        self.config = config
+    module: OracleCritic
+    dataset: Dataset
+    parts: Split
+    config: AapConfig
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The oracle and the critic."""
-        return [ParameterGroup(tuple(self.critic.parameters()))]
+        return [ParameterGroup(tuple(self.module.parameters()))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The critic's loss on a few rollouts."""
@@ -238,7 +224,7 @@ class OracleStage:
         mine = share(len(chosen))
         total, ordered = int(ordered.valid.sum()), ordered.select(mine)
         batch = Batch.of(self.dataset, ordered, turns[mine], flips[mine])
-        loss = action_scoring_loss(self.critic.logits(batch), batch.success, ordered.valid)
+        loss = action_scoring_loss(self.module.logits(batch), batch.success, ordered.valid)
         return StepResult({"critic": loss}, total)
 
     @torch.no_grad()
@@ -250,7 +236,7 @@ class OracleStage:
         def judge(chunk: Sequence[int]) -> tuple[ArrayLike, ArrayLike]:
             ordered = order_rows(self.dataset, chunk, self.config.rows_per_rollout, rng)
             batch = Batch.of(self.dataset, ordered)
-            scores = torch.sigmoid(self.critic.logits(batch))[ordered.valid]
+            scores = torch.sigmoid(self.module.logits(batch))[ordered.valid]
             return scores.numpy(force=True), batch.success[ordered.valid].numpy(force=True)
 
         found = discrimination_in_chunks(rollouts, _CHUNK, judge)
@@ -258,12 +244,15 @@ class OracleStage:
         return {"score": found.bce, "base_rate": found.base_rate} | figures
 
 
-def predict(aap: Aap, seen: SeenRows, context: int) -> PrefixPrediction:
-    """Score all rows after every prefix of the first `context` of them."""
+def predict(aap: Aap, seen: SeenRows, context: int) -> tuple[Tensor, Tensor]:
+    """Logits of the scores of all rows after every prefix of the first K = `context` of them, and z of the prefixes.
+
+    These are [B, K + 1, n] and [B, K + 1, latent_width].
+    """
     tries = (seen.features, seen.xyz, seen.frame, seen.motion, seen.success, seen.details)
     latents = aap.prefix_latents(*aap.interaction_codes(*(x[:, :context] for x in tries)))
     xyz, frames = seen.xyz[:, None], seen.frame[:, None]
-    return PrefixPrediction(aap.action_logits(seen.features[:, None], xyz, frames, latents[:, :, None]), latents)
+    return aap.action_logits(seen.features[:, None], xyz, frames, latents[:, :, None]), latents
 
 
 def train_aap(recipe: StageTrainer) -> TrainingResult:

@@ -3,11 +3,11 @@
 Shapes: B ordered sets of interactions, n rows of each, K the longest context, Q points, S proposals.
 """
 
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from learner.data.dataset import Dataset
 from learner.data.features import FrozenAap
@@ -47,6 +47,7 @@ class Gains:
     mask: Tensor
 
 
+@dataclass(eq=False)
 class AipStage:
     """Trains all of `Aip` but D (AdaAfford, AIP Action Scoring Loss); AAP stays as it is.
 
@@ -61,31 +62,24 @@ class AipStage:
 
     name = "aip"
 
-    def __init__(
-        self,
-        aip: Aip,
-        dataset: Dataset,
-        parts: Split,
-        config: AipConfig,
-        frozen: FrozenAap,
-        teacher: Teacher | None = None,
-    ) -> None:
-        self.module: nn.Module = aip
-        self.aip = aip
-        self.dataset = dataset
-        self.parts = parts
-        self.config = config
-        self.frozen = frozen
-        self._inherits = config.training == "inherited"
-        self._answers = teacher.scores if self._inherits and teacher is not None else dataset.rows.success
+    module: Aip
+    dataset: Dataset
+    parts: Split
+    config: AipConfig
+    frozen: FrozenAap
+    teacher: InitVar[Teacher | None] = None
+
+    def __post_init__(self, teacher: Teacher | None) -> None:
+        self._inherits = self.config.training == "inherited"
+        self._answers = teacher.scores if self._inherits and teacher is not None else self.dataset.rows.success
         if self._inherits:
-            aip.encoder.load_state_dict(frozen.aap.encoder.state_dict())
+            self.module.encoder.load_state_dict(self.frozen.aap.encoder.state_dict())
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """All of AIP but D and what is inherited, at one rate; nothing of AAP."""
-        others = [self.aip.affordance_network(), *([self.aip.encoder] if self._inherits else [])]
+        others = [self.module.affordance_network(), *([self.module.encoder] if self._inherits else [])]
         left = {id(p) for module in others for p in module.parameters()}
-        return [ParameterGroup(tuple(p for p in self.aip.parameters() if id(p) not in left))]
+        return [ParameterGroup(tuple(p for p in self.module.parameters() if id(p) not in left))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The critic's loss on a few rollouts, several ordered subsets of each."""
@@ -175,12 +169,12 @@ class AipStage:
         if self._inherits:
             features = self.frozen.features[candidates]
         else:
-            encoded = self.aip.encoder(self.dataset.clouds.select(ordered.clouds))
+            encoded = self.module.encoder(self.dataset.clouds.select(ordered.clouds))
             places = torch.searchsorted(ordered.clouds, data.cloud[candidates])
-            flat = self.aip.encoder.at(encoded, places.flatten(), data.point[candidates].flatten())
+            flat = self.module.encoder.at(encoded, places.flatten(), data.point[candidates].flatten())
             features = flat.reshape(*candidates.shape, -1)
         told = (data.xyz[candidates], data.frame[candidates])
-        return self.aip.action_scores(features, *told, found.latents[:, :, None], found.scores)
+        return self.module.action_scores(features, *told, found.latents[:, :, None], found.scores)
 
 
 def train_aip(recipe: StageTrainer) -> TrainingResult:

@@ -52,13 +52,7 @@ from shared.io.documents import read_document
 from shared.io.files import exclusive_lock, make_folder, read_bounded, write_atomically
 from shared.networks.network_config import NetworkConfig
 from shared.policies.methods import BASELINES, ModuleName
-from shared.policies.policy import (
-    MAX_POLICY_JSON_BYTES,
-    MAX_WEIGHTS_BYTES,
-    POLICY_FILE,
-    WEIGHTS_FILE,
-    Policy,
-)
+from shared.policies.policy import MAX_POLICY_JSON_BYTES, MAX_WEIGHTS_BYTES, POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.seeds import generator, torch_seed
 from shared.store.coverage import Snapshot
 from shared.store.store import Store

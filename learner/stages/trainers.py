@@ -1,4 +1,4 @@
-"""What the trainings of all stages have in common, and how those of baselines are found."""
+"""What the trainings of all stages have in common, how those of baselines are found, and critics of stored rows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -6,10 +6,11 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from learner.data.dataset import Dataset
-from learner.data.features import FrozenAap, FrozenFeatures, ProposalPool
+from learner.data.features import FrozenAap, FrozenFeatures, FrozenPrior, ProposalPool
 from learner.data.sampling import Split
 from learner.settings import AffordanceConfig, LearnerConfig, LearnerSettings, TrainingConfig
 from learner.stages.affordance import AffordanceStage, Critic, RowOrder
@@ -18,7 +19,7 @@ from learner.training.hardware import Hardware
 from learner.training.loop import Stage, TrainingResult, train
 from shared.config import parse
 from shared.errors import UsageError
-from shared.policies.methods import BASELINES, BaselineName, ModuleName
+from shared.policies.methods import BASELINES, BaselineName, CriticName, ModuleName
 from shared.policies.policy import Policy
 from shared.seeds import generator
 
@@ -187,3 +188,28 @@ def check_baselines(settings: LearnerSettings) -> None:
         if table := training_of(name).table:
             raise UsageError(f"settings of the baseline '{name}' belong into the table '{table}', not into 'baselines'")
         settings_of(settings, name)
+
+
+def row_critic(name: CriticName, policy: Policy, known: FrozenFeatures) -> RowCritic:
+    """The critic of a policy that is called `name`; what does not depend on interactions is computed once for all rows.
+
+    Raises:
+        UsageError: its network is not trained.
+    """
+    if name == "where2act":
+        scores = FrozenPrior.of(policy.prior, known).scores
+        return lambda asked, tries: scores[asked]
+    if name == "aap":
+        return adaptive_critic(FrozenAap.of(policy.aap, known))
+    policy.require(name)
+    return training_of(name).row_critic(policy, known)
+
+
+def adaptive_critic(frozen: FrozenAap) -> RowCritic:
+    """The critic of an AAP, or of a baseline whose network has its form."""
+
+    @torch.no_grad()
+    def scores(asked: Tensor, tries: Tensor) -> Tensor:
+        return torch.sigmoid(frozen.logits(asked, frozen.latents(tries)[-1]))
+
+    return scores

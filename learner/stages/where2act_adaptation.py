@@ -3,16 +3,18 @@
 Shapes: B ordered sets of interactions, n rows of each, K the longest context.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from learner.data.dataset import Dataset
 from learner.data.features import FrozenFeatures, FrozenPrior
 from learner.data.sampling import OrderedRows, Split, draw, order_rows, spread
 from learner.metrics import discrimination
 from learner.settings import AdaptationConfig
-from learner.stages.trainers import BaselineTraining, Load, StageTrainer
+from learner.stages.trainers import BaselineTraining, Load, RowCritic, StageTrainer
 from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import correction_loss
@@ -23,6 +25,7 @@ VALIDATION_ROLLOUTS = 32
 _VALIDATION_SEED = 24
 
 
+@dataclass(eq=False)
 class AdaptationStage:
     """Trains the similarities, over a Where2Act that stays as it is (AdaAfford, supplement, Details of Baselines).
 
@@ -32,24 +35,15 @@ class AdaptationStage:
 
     name = NAME
 
-    def __init__(
-        self,
-        network: Where2ActAdaptation,
-        dataset: Dataset,
-        parts: Split,
-        config: AdaptationConfig,
-        prior: FrozenPrior,
-    ) -> None:
-        self.module: nn.Module = network
-        self.network = network
-        self.dataset = dataset
-        self.parts = parts
-        self.config = config
-        self.prior = prior
+    module: Where2ActAdaptation
+    dataset: Dataset
+    parts: Split
+    config: AdaptationConfig
+    prior: FrozenPrior
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The similarity network, at one rate."""
-        return [ParameterGroup(tuple(self.network.parameters()))]
+        return [ParameterGroup(tuple(self.module.parameters()))]
 
     def loss(self, rng: np.random.Generator) -> StepResult:
         """The squared error of corrected scores on a few rollouts."""
@@ -66,7 +60,7 @@ class AdaptationStage:
         ordered = order_rows(self.dataset, rollouts, self.config.rows_per_rollout, rng)
         context = ordered.longest_context(self.config.context)
         asked = ordered.asked(context)[:, -1]
-        corrected = corrected_scores(self.network, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
+        corrected = corrected_scores(self.module, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
         success = self.dataset.rows.success[ordered.rows][asked].numpy(force=True)
         before, after = (
             discrimination(corrected[:, :, prefix][asked].clamp(0.0, 1.0).numpy(force=True), success)
@@ -83,7 +77,7 @@ class AdaptationStage:
 
     def _loss(self, ordered: OrderedRows) -> Tensor:
         context = ordered.longest_context(self.config.context)
-        corrected = corrected_scores(self.network, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
+        corrected = corrected_scores(self.module, self.dataset, self.prior, ordered.rows, ordered.rows[:, :context])
         success = self.dataset.rows.success[ordered.rows]
         # Without an interaction nothing is corrected, and nothing could be learnt.
         return correction_loss(corrected[..., 1:], success[..., None], ordered.asked(context)[:, 1:].transpose(1, 2))
@@ -112,30 +106,24 @@ def corrected_scores(
     return torch.cat([before, before + added], dim=-1)
 
 
-class CorrectedScores:
-    """Where2Act-adaptation."""
-
-    def __init__(self, network: Where2ActAdaptation, prior: FrozenPrior, dataset: Dataset) -> None:
-        self._network, self._prior, self._dataset = network, prior, dataset
-
-    @torch.no_grad()
-    def __call__(self, asked: Tensor, tries: Tensor) -> Tensor:
-        """s_u + sum (r - s) sim_pq, cut to [0, 1]."""
-        if not len(tries):
-            return self._prior.scores[asked]
-        corrected = corrected_scores(self._network, self._dataset, self._prior, asked[None], tries[None])
-        return corrected[0, :, -1].clamp(0.0, 1.0)
-
-
 def _train(recipe: StageTrainer, config: AdaptationConfig) -> TrainingResult:
     network = recipe.policy.baseline(NAME, Where2ActAdaptation).requires_grad_(True)
     prior = FrozenPrior.of(recipe.policy.prior, recipe.known)
     return recipe.runner.train(AdaptationStage(network, recipe.dataset, recipe.parts, config, prior), config, NAME)
 
 
-def _row_critic(policy: Policy, known: FrozenFeatures) -> CorrectedScores:
-    network = policy.baseline(NAME, Where2ActAdaptation)
-    return CorrectedScores(network, FrozenPrior.of(policy.prior, known), known.dataset)
+def _row_critic(policy: Policy, known: FrozenFeatures) -> RowCritic:
+    network, prior = policy.baseline(NAME, Where2ActAdaptation), FrozenPrior.of(policy.prior, known)
+
+    @torch.no_grad()
+    def scores(asked: Tensor, tries: Tensor) -> Tensor:
+        """s_u + sum (r - s) sim_pq, cut to [0, 1]."""
+        if not len(tries):
+            return prior.scores[asked]
+        corrected = corrected_scores(network, known.dataset, prior, asked[None], tries[None])
+        return corrected[0, :, -1].clamp(0.0, 1.0)
+
+    return scores
 
 
 def _load(config: AdaptationConfig) -> Load:

@@ -4,20 +4,20 @@ Shapes: B rollouts, n rows of each.
 """
 
 from collections.abc import Sequence
+from dataclasses import InitVar, dataclass
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from learner.data.dataset import Dataset
 from learner.data.features import FrozenAap, FrozenFeatures, FrozenPrior
 from learner.data.sampling import Batch, OrderedRows, Split, draw, draw_flips, draw_turns, padded, spread
-from learner.evaluation.critics import AdaptiveScores
 from learner.metrics import discrimination_in_chunks
 from learner.settings import InteractionConfig
 from learner.stages.affordance import AapCritic
-from learner.stages.trainers import BaselineTraining, Load, StageTrainer
+from learner.stages.trainers import BaselineTraining, Load, RowCritic, StageTrainer, adaptive_critic
 from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_loss
@@ -34,6 +34,7 @@ _CHUNK = 4
 """Rollouts validated at once."""
 
 
+@dataclass(eq=False)
 class InteractionStage:
     """Trains all of `Where2ActInteraction` but D, on the loss of Where2Act's critic.
 
@@ -43,25 +44,19 @@ class InteractionStage:
 
     name = NAME
 
-    def __init__(
-        self,
-        network: Where2ActInteraction,
-        dataset: Dataset,
-        parts: Split,
-        config: InteractionConfig,
-        prior: FrozenPrior,
-    ) -> None:
-        self.module: nn.Module = network
-        self.network = network
-        self.dataset = dataset
-        self.parts = parts
-        self.config = config
-        self._places = dataset.rows.xyz.numpy(force=True).astype(np.float64)
+    module: Where2ActInteraction
+    dataset: Dataset
+    parts: Split
+    config: InteractionConfig
+    prior: InitVar[FrozenPrior]
+
+    def __post_init__(self, prior: FrozenPrior) -> None:
+        self._places = self.dataset.rows.xyz.numpy(force=True).astype(np.float64)
         self._actionability: Float32 = prior.actionability.numpy(force=True)
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """The branch and the critic; the encoder, which Where2Act has trained, more slowly."""
-        network = self.network
+        network = self.module
         old = tuple(network.encoder.parameters())
         # Four interactions are always there, so that the z of none is never learnt.
         left = {id(p) for p in (*old, *network.affordance_network().parameters(), network.empty_latent)}
@@ -108,11 +103,11 @@ class InteractionStage:
         """Logits of all rows after the interactions, successes, and which rows are no interactions, [B, n] each."""
         batch = Batch.of(self.dataset, ordered, turns, flips)
         context = ordered.longest_context(TRIES)
-        features = batch.features(self.network.encoder)
+        features = batch.features(self.module.encoder)
         tries = (features, batch.xyz, batch.frame, batch.motion, batch.success, batch.details)
-        codes, weights = self.network.interaction_codes(*(column[:, :context] for column in tries))
-        latents = self.network.prefix_latents(codes, weights)[:, -1:]
-        logits = self.network.action_logits(features, batch.xyz, batch.frame, latents)
+        codes, weights = self.module.interaction_codes(*(column[:, :context] for column in tries))
+        latents = self.module.prefix_latents(codes, weights)[:, -1:]
+        logits = self.module.action_logits(features, batch.xyz, batch.frame, latents)
         return logits, batch.success, ordered.asked(context)[:, -1]
 
 
@@ -149,8 +144,8 @@ def _train(recipe: StageTrainer, config: InteractionConfig) -> TrainingResult:
     return recipe.runner.train_affordance(affordance, settings, result)
 
 
-def _row_critic(policy: Policy, known: FrozenFeatures) -> AdaptiveScores:
-    return AdaptiveScores(FrozenAap.of(policy.baseline(NAME, Where2ActInteraction), known), known.dataset)
+def _row_critic(policy: Policy, known: FrozenFeatures) -> RowCritic:
+    return adaptive_critic(FrozenAap.of(policy.baseline(NAME, Where2ActInteraction), known))
 
 
 def _load(config: InteractionConfig) -> Load:

@@ -57,8 +57,11 @@ class Stage(Protocol):
     """What is trained, on what, and how it is judged."""
 
     name: str
-    module: nn.Module
-    """Holds everything that is trained."""
+
+    @property
+    def module(self) -> nn.Module:
+        """Holds everything that is trained."""
+        ...
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """What the optimiser may change."""

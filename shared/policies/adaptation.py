@@ -9,6 +9,7 @@ Shapes: N points of a cloud, A actions, S proposals at a point.
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -147,8 +148,7 @@ class Adapter:
     @torch.inference_mode()
     def beliefs(self, observation: Observation, points: NDArray[np.int64], frames: Tensor, latents: Tensor) -> Tensor:
         """The AAP scores s_u|z of the actions that `imagined` describes, under each of some z, [Z, A]."""
-        features, places = self.features(observation, "aap", points), self.places(observation, points)
-        return torch.sigmoid(self.policy.aap.action_logits(features, places, frames, latents[:, None]))
+        return self._scores(observation, "aap", points, frames, latents[:, None])
 
     @torch.inference_mode()
     def affordance(
@@ -176,19 +176,22 @@ class Adapter:
         module: ModuleName = "aap",
     ) -> Float32:
         """The AAP scores s_u|z of actions after a history, [A], in [0, 1]."""
-        indices = point_indices(actions)
-        features = self.features(observation, module, indices)
-        points, frames = self.places(observation, indices), self.frames(observation, actions)
-        logits = self._adaptive(module).action_logits(features, points, frames, self.z(history, module))
-        return torch.sigmoid(logits).numpy()
+        points, frames = point_indices(actions), self.frames(observation, actions)
+        return self._scores(observation, module, points, frames, self.z(history, module)).numpy()
 
     @torch.inference_mode()
     def prior_score(self, observation: Observation, actions: Sequence[Action]) -> Float32:
         """Where2Act's scores of actions, [A], in [0, 1]."""
-        indices = point_indices(actions)
-        features = self.features(observation, "prior", indices)
-        points, frames = self.places(observation, indices), self.frames(observation, actions)
-        return torch.sigmoid(self.policy.prior.action_logits(features, points, frames)).numpy()
+        return self._scores(observation, "prior", point_indices(actions), self.frames(observation, actions)).numpy()
+
+    @torch.inference_mode()
+    def _scores(
+        self, observation: Observation, module: ModuleName, points: NDArray[np.int64], frames: Tensor, *latents: Tensor
+    ) -> Tensor:
+        """A module's scores of actions, in [0, 1], under z unless it is the prior; what is at one point broadcasts."""
+        network: Any = self.policy.prior if module == "prior" else self._adaptive(module)
+        features, places = self.features(observation, module, points), self.places(observation, points)
+        return torch.sigmoid(network.action_logits(features, places, frames, *latents))
 
     @torch.inference_mode()
     def features(self, observation: Observation, module: ModuleName, points: NDArray[np.int64]) -> Tensor:
@@ -239,17 +242,12 @@ class Adapter:
         self, observation: Observation, proposals: Proposals, latent: Tensor, module: ModuleName = "aap"
     ) -> Tensor:
         """The AAP scores s_u|z of proposals, [S]."""
-        index = np.array([proposals.point])
-        features, points = self.features(observation, module, index), self.places(observation, index)
-        return torch.sigmoid(self._adaptive(module).action_logits(features, points, proposals.frames, latent))
+        return self._scores(observation, module, np.array([proposals.point]), proposals.frames, latent)
 
     @torch.inference_mode()
     def prior_score_proposals(self, observation: Observation, proposals: Proposals) -> Tensor:
         """Where2Act's scores of proposals, [S]."""
-        index = np.array([proposals.point])
-        features = self.features(observation, "prior", index)
-        points = self.places(observation, index)
-        return torch.sigmoid(self.policy.prior.action_logits(features, points, proposals.frames))
+        return self._scores(observation, "prior", np.array([proposals.point]), proposals.frames)
 
     @torch.inference_mode()
     def information_proposals(self, observation: Observation, proposals: Proposals, latent: Tensor) -> Tensor:

@@ -156,15 +156,6 @@ METHODS: Registry[Method] = Registry(
 """In the order of the paper's table, then what it does not have."""
 
 
-def method_named(name: MethodName) -> Method:
-    """The method called `name`.
-
-    Raises:
-        UsageError: there is no such method; the message lists those there are.
-    """
-    return METHODS.get(name)
-
-
 def needs_policy(proposer: Name) -> bool:
     """Whether a proposer uses networks.
 

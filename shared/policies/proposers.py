@@ -4,6 +4,7 @@ Everything here runs on the CPU in a few milliseconds a step and depends on its 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ STOP_THRESHOLD = 0.0
 stop at once; 0 stops where no point promises any gain."""
 
 
+@dataclass(eq=False)
 class AipProposer:
     """Proposes the next interaction by the AIP module (AdaAfford, Next-step Interaction Action Proposal).
 
@@ -37,22 +39,15 @@ class AipProposer:
 
     name = "aip"
 
-    def __init__(
-        self,
-        adapter: Adapter,
-        rng: np.random.Generator,
-        budget: int,
-        threshold: float = STOP_THRESHOLD,
-        at_least: int = 1,
-        share: float | None = None,
-    ) -> None:
-        adapter.policy.require("prior", "aap", "aip")
-        self.adapter = adapter
-        self.rng = rng
-        self.budget = budget
-        self.threshold = threshold
-        self.at_least = at_least
-        self.share = share
+    adapter: Adapter
+    rng: np.random.Generator
+    budget: int
+    threshold: float = STOP_THRESHOLD
+    at_least: int = 1
+    share: float | None = None
+
+    def __post_init__(self) -> None:
+        self.adapter.policy.require("prior", "aap", "aip")
 
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
         """The next action, or None to stop."""

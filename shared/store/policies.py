@@ -49,17 +49,13 @@ def publish_policy(backend: StorageBackend, version: int, files: Mapping[str, by
     def describe(held: Mapping[str, bytes]) -> bytes:
         if held != files:
             raise StoreError(f"{folder}: another attempt left other files here; run `adaafford store repair`")
-        return _index(version, held)
+        return with_checksum(PolicyIndex(version=version, files=file_entries(held)).as_document())
 
     published = backend.publish(
         Transaction(folder.key, files, INDEX_FILE, describe=describe, check=lambda: None, lock="policies")
     )
     if not published and read_policy(backend, version) != dict(files):
         raise StoreError(f"{folder}: exists with other content; publish under the next version")
-
-
-def _index(version: int, files: Mapping[str, bytes]) -> bytes:
-    return with_checksum(PolicyIndex(version=version, files=file_entries(files)).as_document())
 
 
 def read_policy(backend: StorageBackend, version: int) -> dict[str, bytes]:

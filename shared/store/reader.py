@@ -29,16 +29,7 @@ from shared.store.layout import (
     parse_shard_id,
 )
 from shared.store.validity import MAX_PARTS, check_quarantined, check_rollouts
-from shared.types import (
-    Action,
-    Direction,
-    HiddenDynamics,
-    Observation,
-    Order,
-    Outcome,
-    OutcomeKind,
-    Role,
-)
+from shared.types import Action, Direction, HiddenDynamics, Observation, Order, Outcome, OutcomeKind, Role
 
 Item = TypeVar("Item")
 

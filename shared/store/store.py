@@ -469,11 +469,6 @@ class Store:
         return Path(self.where)
 
     @property
-    def shards_folder(self) -> Path:
-        """The folder of the shards; raises as `path` does."""
-        return self.path / SHARDS_FOLDER
-
-    @property
     def crash_log(self) -> CrashLog:
         """The heartbeats and crash logs of workers."""
         return CrashLog(None, self.where) if is_url(self.where) else CrashLog(self.path / CRASH_LOG_FOLDER)

@@ -70,7 +70,8 @@ def _check_rollout(rollout: RolloutRecord, points: int) -> None:
     _check_texts(rollout.fidelity, rollout.status, rollout.object.category)
     if missing := ALWAYS_DRAWN.keys() - rollout.dynamics.values.keys():
         raise ValueError(f"lacks the hidden parameter '{min(missing)}'")
-    _check_finite("rollout's numbers", _rollout_numbers(rollout))
+    drawn = [*rollout.dynamics.values.values(), rollout.azimuth_deg, rollout.elevation_deg]
+    _check_finite("rollout's numbers", drawn)
     for observation in rollout.observations:
         check_observation(observation, points)
     if rollout.status is not RolloutStatus.OK and (rollout.interactions or rollout.observations):
@@ -83,10 +84,6 @@ def _check_rollout(rollout: RolloutRecord, points: int) -> None:
             _check_interaction(interaction, rollout)
         except (ValueError, TypeError, AttributeError) as error:
             raise ValueError(f"step {interaction.step}: {error}") from None
-
-
-def _rollout_numbers(rollout: RolloutRecord) -> list[float]:
-    return [*rollout.dynamics.values.values(), rollout.azimuth_deg, rollout.elevation_deg]
 
 
 def _check_interaction(interaction: InteractionRecord, rollout: RolloutRecord) -> None:

@@ -7,12 +7,7 @@ import pytest
 
 from shared.errors import UsageError
 from shared.networks.network_config import NetworkConfig
-from shared.policies.adaptation import (
-    Adapter,
-    action_from_frame,
-    frames_in_view,
-    movable_points,
-)
+from shared.policies.adaptation import Adapter, action_from_frame, frames_in_view, movable_points
 from shared.policies.policy import Policy
 from shared.policies.proposers import TOP_POINTS, AipProposer, ExploitProposer, points_of
 from shared.types import Action, Interaction, Outcome, OutcomeKind, Proposer

@@ -20,15 +20,7 @@ from shared.policies.adaptation import Adapter, action_from_frame, frames_in_vie
 from shared.policies.critics import Critic, critic_named
 from shared.policies.fps import LEAST_POINTS, THRESHOLD, FpsProposer, actionable_points, distances_to
 from shared.policies.imagined_outcomes import ASKED, BEST, CANDIDATES, SURE, USUAL_MOTION
-from shared.policies.methods import (
-    METHODS,
-    BaselineName,
-    CriticName,
-    Method,
-    baselines_of,
-    method_named,
-    versions_of,
-)
+from shared.policies.methods import METHODS, BaselineName, CriticName, Method, baselines_of, versions_of
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.policies.proposers import proposer_named
 from shared.policies.where2act_interaction import TRIES, Where2ActInteraction
@@ -284,7 +276,7 @@ def test_an_unknown_proposer_is_refused_with_those_there_are(adapter: Adapter) -
 
 @pytest.mark.parametrize("name", sorted(METHODS.names()))
 def test_every_method_runs_the_loop(adapter: Adapter, name: str) -> None:
-    method, observation = method_named(name), observation_of()
+    method, observation = METHODS.get(name), observation_of()
     history: list[Interaction] = []
     for budget in method.budgets((4, 1)):
         if method.tries not in (None, "random"):

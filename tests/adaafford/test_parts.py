@@ -16,14 +16,7 @@ from cluster.cli.main import run as adaafford
 from shared.errors import StoreError, UsageError
 from shared.policies.policy import CORE, WEIGHTS_FILE, Policy
 from shared.segmentation.scenes import Kind
-from shared.segmentation.segmenter import (
-    SEGMENTATION_FILE,
-    Part,
-    Segmentation,
-    Segmenter,
-    begun,
-    part_labels,
-)
+from shared.segmentation.segmenter import SEGMENTATION_FILE, Part, Segmentation, Segmenter, begun, part_labels
 from shared.types import Float
 from tests.support.small_networks import TINY
 

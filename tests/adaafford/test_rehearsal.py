@@ -18,7 +18,7 @@ from cluster.cli.main import run as adaafford
 from cluster.evaluation import rehearsal
 from cluster.evaluation.rehearsal import STATE, Executed, Setting, SimulatedRobot
 from collector.objects.procedural.catalogue import generate
-from collector.sim.depth_noise import LEVEL_M, noisy
+from collector.sim.camera import LEVEL_M, noisy
 from collector.sim.environment import SapienEnvironment, camera_for
 from shared.config import CameraConfig
 from shared.errors import UsageError

@@ -22,7 +22,7 @@ from collector.rollout import draw_arm_base
 from collector.setting import make_setting
 from collector.sim.armed import ArmedEnvironment
 from collector.sim.restoration import restored
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from collector.worker import Worker
 from shared.arms.arm import ARMS, URDF
 from shared.arms.kinematics import chain_of

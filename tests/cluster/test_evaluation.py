@@ -1,7 +1,6 @@
 """Evaluation by itself: intervals are honest, tables say what was found, and a stop changes nothing."""
 
 import csv
-import dataclasses
 import io
 import json
 import shutil
@@ -16,9 +15,15 @@ from hypothesis import strategies as st
 from cluster.cli.main import run as adaafford
 from cluster.config.command_settings import EvaluateSettings
 from cluster.evaluation.evaluate import PROPOSER, Evaluation
-from cluster.evaluation.policy_evaluation import evaluate_policy
 from cluster.evaluation.run_evaluation import evaluate_run, evaluate_without_run
-from cluster.evaluation.tables import CSV_FILE, MARKDOWN_FILE, RESULTS_FILE, EvaluationTable, as_markdown
+from cluster.evaluation.tables import (
+    CSV_FILE,
+    MARKDOWN_FILE,
+    RESULTS_FILE,
+    EvaluationTable,
+    as_markdown,
+    evaluate_policy,
+)
 from cluster.workers.retries import JobError
 from cluster.workers.session import CurrentWorkerGroup
 from collector.objects.procedural.catalogue import generate
@@ -78,14 +83,16 @@ def table_of(**values: object) -> EvaluationTable:
     row = {
         **{"method": "ours-final", "budget": 2, "f_score": 0.5, "f_score_low": 0.25, "f_score_high": 0.75},
         **{"sample_success": None, "sample_success_low": None, "sample_success_high": None, "trials": 0},
-        **{"start_success": 0.4, "start_success_low": 0.2, "start_success_high": 0.6, "counts": {"object": ["a"]}},
+        **{"start_success": 0.4, "start_success_low": 0.2, "start_success_high": 0.6, "queries": 24},
         **{"best_f": 0.6, "bce": 0.5, "auc": None, "base_rate": 0.3, "mean_tries": 2.0, "gap_closed": None},
         **{"mix_f_score": 0.8, "mix_f_score_low": 0.7, "mix_f_score_high": 0.9, "mix_base_rate": 0.45},
         **{"shifted_f_score": None, "shifted_f_score_low": None, "shifted_f_score_high": None},
         **{"share_success": None, "share_success_low": None, "share_success_high": None},
     }
     share = 0.01 if "share_success" in values else None
-    return EvaluationTable("push-faucet", 1, 4, 40, 2, share, "ab" * 32, {"a": "cd" * 32}, (row | values,))
+    return EvaluationTable(
+        "push-faucet", 1, 4, 40, 2, share, "ab" * 32, {"a": "cd" * 32}, (EvaluationRow(**row | values),)
+    )
 
 
 def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
@@ -98,7 +105,7 @@ def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     assert "drawn from the best 1% of the cloud" in both
     assert "30.0% succeed" in shown
     assert "of which 45.0% succeed (a critic that always says yes has an F-score of 62.1)" in shown
-    read = list(csv.DictReader(io.StringIO(csv_table(table_of().rows, ["counts"]))))
+    read = list(csv.DictReader(io.StringIO(csv_table([row.model_dump() for row in table_of().rows], ["counts"]))))
     assert (read[0]["f_score"], read[0]["auc"]) == ("0.5", "")
     assert "counts" not in read[0]
 
@@ -151,9 +158,9 @@ def test_trials_of_two_policies_are_never_mixed(finished: Path, tmp_path: Path) 
 
 
 def row_of(method: str, budget: int, f_score: float) -> EvaluationRow:
-    figures = dict.fromkeys((field.name for field in dataclasses.fields(EvaluationRow)), 0.5)
-    told = {"method": method, "budget": budget, "f_score": f_score, "counts": ObjectCounts(*[()] * 9)}
-    return EvaluationRow(**figures | told)
+    figures = dict.fromkeys(("best_f", "bce", "auc", "base_rate", "sample_success", "mean_tries"), 0.5)
+    counts, told = ObjectCounts(*[()] * 9), {"method": method, "budget": budget, "queries": 1, "trials": 1}
+    return EvaluationRow(f_score=f_score, counts=counts, **told, **figures)
 
 
 def test_where2act_stands_at_every_budget_and_the_oracle_closes_the_gap(
@@ -166,10 +173,10 @@ def test_where2act_stands_at_every_budget_and_the_oracle_closes_the_gap(
     rows = [row_of("where2act", 0, 0.2), row_of("oracle", 0, 0.7), row_of("ours-final", 4, 0.6)]
     no_gap = [*rows[::2], row_of("oracle", 0, 0.1)]
     for known, closed in ((rows, {0.0, 1.0, 0.8}), (rows[::2], {None}), (no_gap, {None})):
-        monkeypatch.setattr("cluster.evaluation.policy_evaluation.evaluate_store", lambda *_, known=known: known)
+        monkeypatch.setattr("cluster.evaluation.tables.evaluate_store", lambda *_, known=known: known)
         table = evaluate_policy(evaluation, 1, tmp_path / "no-oracle")
-        assert [row["budget"] for row in table.rows if row["method"] == "where2act"] == [1, 4]
-        assert {row["gap_closed"] and round(row["gap_closed"], 9) for row in table.rows} == closed
+        assert [row.budget for row in table.rows if row.method == "where2act"] == [1, 4]
+        assert {row.gap_closed and round(row.gap_closed, 9) for row in table.rows} == closed
 
 
 def test_what_does_not_suit_is_refused_in_one_line(

@@ -19,7 +19,6 @@ import pytest
 from cluster.cli.main import run as run_command
 from cluster.config.campaign_config import CampaignConfig
 from cluster.evaluation.published import published
-from cluster.evaluation.tables import ResultRow
 from cluster.evaluation.trials import EvaluationTrial, first_trials, most_telling
 from cluster.reporting.clouds import TANGENT, CloudView, draw_panels, tried
 from cluster.reporting.collecting import wilson
@@ -30,6 +29,7 @@ from cluster.reporting.training import after_tries, curves_of, read_entries
 from cluster.reporting.trial_sections import FailedExploit, varied
 from cluster.runs.run_folder import ObjectsUsed, RunFolder, begin
 from cluster.runs.run_log import RunLog
+from learner.evaluation.table import EvaluationRow
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import StoreError
 from shared.plan import EvaluationConfig, Job, ObjectRef, Plan, RolloutRecord, Setting
@@ -157,8 +157,8 @@ def write_trainings(made: RunFolder) -> None:
         (made.training(stage) / name).write_text(text)
 
 
-def row_of(method: str, budget: int, f_score: float | None = 0.5, sample_success: float | None = 0.25) -> ResultRow:
-    return ResultRow(
+def row_of(method: str, budget: int, f_score: float | None = 0.5, sample_success: float | None = 0.25) -> EvaluationRow:
+    return EvaluationRow(
         method=method,
         budget=budget,
         f_score=f_score,
@@ -338,7 +338,7 @@ def test_the_paper_has_figures_for_every_task_and_method() -> None:
 
 def test_the_best_of_a_column_is_marked_and_the_oracle_never() -> None:
     rows = (row_of("where2act", 1, 0.2), row_of("ours-final", 1, 0.6, None), row_of("oracle", 0, 0.9, None))
-    table = table_of(Results("push-faucet", rows))
+    table = table_of(Results(task="push-faucet", objects=1, rows=rows))
     marks = {cells[0].text: [cell.kind for cell in cells[1:]] for cells in table.body}
     assert marks["ours-final"][0] == "best"
     assert marks["where2act"] == ["", "paper", "best", "paper", ""]
@@ -348,16 +348,16 @@ def test_the_best_of_a_column_is_marked_and_the_oracle_never() -> None:
 
 
 def test_a_task_that_the_paper_lacks_has_no_columns_of_it() -> None:
-    table = table_of(Results("another", (row_of("ours-final", 1),)))
+    table = table_of(Results(task="another", objects=1, rows=(row_of("ours-final", 1),)))
     assert [len(row) for row in table.body] == [4]
     assert sum(cell.span for cell in table.head[0]) == len(table.head[1]) == 4
 
 
 def test_what_was_measured_as_in_the_paper_stands_in_a_table_beside_it() -> None:
     row = row_of("ours-final", 1)
-    assert like_for_like(Results("push-faucet", (row,))) == ()  # Files of older versions.
+    assert like_for_like(Results(task="push-faucet", objects=1, rows=(row,))) == ()  # Files of older versions.
     measured = {"mix_f_score": 0.8, "mix_f_score_low": 0.7, "mix_f_score_high": 0.9, "mix_base_rate": 0.45}
-    (table,) = like_for_like(Results("push-faucet", (row.model_copy(update=measured),)))
+    (table,) = like_for_like(Results(task="push-faucet", objects=1, rows=(row.model_copy(update=measured),)))
     assert [cell.text for cell in table.head[0]] == ["method", "F, published mix"]
     (cells,) = table.body
     assert [(cell.text, cell.note) for cell in cells[1:]] == [("80.0", "70\u201390"), ("77.4", "")]

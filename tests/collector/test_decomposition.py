@@ -14,8 +14,8 @@ import pytest
 from collector.objects import decomposition, meshes
 from collector.objects.articulation import ArticulatedObject, Mesh
 from collector.objects.catalogue import load_ref, scan
+from collector.objects.child_process import decode, encode
 from collector.objects.decomposition import Decomposer
-from collector.objects.mesh_bytes import decode, encode
 from collector.objects.procedural import generate
 from collector.sim.scene import Scene
 from shared.config import FIDELITIES

@@ -8,9 +8,9 @@ import pytest
 from collector.objects.catalogue import for_task, load_ref, scan
 from collector.objects.procedural import generate
 from collector.rollout import begin
-from collector.sim.depth_noise import LEVEL_M
+from collector.sim.camera import LEVEL_M
 from collector.sim.environment import SapienEnvironment
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from shared.config import CameraConfig, CollectionConfig, parse
 from shared.errors import UsageError
 from shared.geometry import camera_pose

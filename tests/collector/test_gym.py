@@ -17,15 +17,14 @@ from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 import adaafford
 import shared.extras as extras_module
 from adaafford.gymnasium_ids import env_id, register
-from collector.gym.spaces import NOT_EXECUTED, action_of, action_values, observation_of
+from collector.gym.environment import NOT_EXECUTED, action_of, action_values, observation_of
 from collector.objects.catalogue import load_ref
 from collector.objects.procedural import generate
 from collector.random_proposer import RandomProposer
 from collector.recorder import interact
 from collector.rollout import object_of, run_rollout
-from collector.sim.simulator import Simulator
+from collector.sim.simulator import Simulator, StageClock
 from collector.simulated_objects import SimulatedObjects
-from collector.stopwatch import StageClock
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import UsageError
 from shared.extensions import Registry

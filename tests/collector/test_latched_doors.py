@@ -14,7 +14,7 @@ from collector.objects.catalogue import load_ref
 from collector.objects.procedural import generate
 from collector.objects.readers import read_object
 from collector.sim.environment import SapienEnvironment
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from learner.data.dataset import FACTS_WIDTH, load_dataset
 from shared.config import CameraConfig, CollectionConfig
 from shared.errors import UsageError

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from collector.objects.cache import ObjectCache, mesh_bytes
-from collector.objects.catalogue import scan
+from collector.objects.catalogue import ObjectCache, mesh_bytes, scan
 from collector.objects.procedural import generate
 
 

@@ -11,8 +11,7 @@ from collector.objects.catalogue import load, scan
 from collector.objects.procedural.catalogue import generate
 from collector.scenes import make_scenes
 from collector.sim.camera import SURROUNDINGS, EmbreeCamera
-from collector.sim.raw_scan import random_scan, raw_scan
-from collector.sim.surroundings import draw_surroundings, extent
+from collector.sim.raw_scan import draw_surroundings, extent, random_scan, raw_scan
 from shared.config import CameraConfig
 from shared.errors import UsageError
 from shared.geometry import camera_pose

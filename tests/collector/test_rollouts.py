@@ -17,14 +17,14 @@ from collector.setting import packages_used
 from collector.sim.camera import EmbreeCamera, observation_from
 from collector.sim.environment import draw_state
 from collector.sim.scene import Scene
+from collector.sim.simulator import StageClock
 from collector.sim.trial import Trial
-from collector.stopwatch import StageClock
 from collector.worker import Worker
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig
 from shared.errors import ObjectError, UsageError
 from shared.geometry import camera_pose
 from shared.plan import EvaluationConfig, Job, Plan, RolloutRecord, Setting
-from shared.policies.methods import METHODS, method_named
+from shared.policies.methods import METHODS
 from shared.primitives import PRIMITIVES
 from shared.store import Store
 from shared.tasks import TASKS, task_named
@@ -356,7 +356,7 @@ def test_a_depth_image_is_kept_beside_the_same_cloud() -> None:
 
 def test_an_unknown_method_is_refused_with_those_there_are() -> None:
     with pytest.raises(UsageError, match="ours-final"):
-        method_named("ours-fianl")
+        METHODS.get("ours-fianl")
 
 
 @pytest.mark.real_objects

@@ -217,8 +217,8 @@ def test_a_rollout_with_other_parameters_than_the_setting_is_refused(tmp_path: P
 def test_shards_of_another_setting_are_a_problem(tmp_path: Path) -> None:
     store, other = fabricated(tmp_path / "store", {}), fabricated(tmp_path / "other", {"wind": 1.0})
     shard = other.jobs()[0].shard_id
-    shutil.rmtree(store.shards_folder / shard)
-    shutil.copytree(other.shards_folder / shard, store.shards_folder / shard)
+    shutil.rmtree(store.path / "shards" / shard)
+    shutil.copytree(other.path / "shards" / shard, store.path / "shards" / shard)
     assert [problem.what for problem in verify(store)] == ["rollout 0 has other hidden parameters than the store's"]
 
 
@@ -237,7 +237,7 @@ def test_the_copies_in_the_interactions_must_be_those_of_the_rollouts(tmp_path: 
 
 @pytest.mark.parametrize("cells", [[1], ["a"], [float("nan")], [None]])
 def test_a_hostile_column_is_refused(cells: list[Any], tmp_path: Path) -> None:
-    file = next((fabricated(tmp_path / "store", {}).shards_folder).rglob("rollouts.parquet"))
+    file = next((fabricated(tmp_path / "store", {}).path / "shards").rglob("rollouts.parquet"))
     table = pq.read_table(file).append_column("hidden_wind", pa.array(cells))
     pq.write_table(table, file, use_dictionary=False)
     with pytest.raises(StoreError, match="foreign"):

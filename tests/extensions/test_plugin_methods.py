@@ -7,11 +7,10 @@ import pytest
 from cluster.cli.main import run
 from learner.data.dataset import load_dataset
 from learner.data.features import FrozenFeatures
-from learner.evaluation.critics import row_critic
 from learner.evaluation.table import evaluate_store
 from learner.settings import LearnerConfig
 from learner.stages.jobs import StageJob, read_policy_folder, run_stage
-from learner.stages.trainers import check_baselines, settings_of
+from learner.stages.trainers import check_baselines, row_critic, settings_of
 from shared.errors import StoreError, UsageError
 from shared.plan import Plan, found_by_name
 from shared.policies.adaptation import Adapter

@@ -11,13 +11,12 @@ from torch import nn
 
 from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import FrozenFeatures, FrozenPrior
-from learner.evaluation.critics import OracleScores, row_critic
 from learner.evaluation.table import NO_TRIES_METHOD, ORACLE_METHOD, PRIOR_METHOD, evaluate, evaluate_store
 from learner.settings import AdaptationConfig, InteractionConfig, LearnerConfig, TrainingConfig
 from learner.stages.jobs import StageJob, read_policy_folder, run_stage
-from learner.stages.oracle import OracleCritic, read_oracle
+from learner.stages.oracle import OracleCritic, Teacher, read_oracle
 from learner.stages.prior import PriorStage
-from learner.stages.trainers import ORACLE_FILE
+from learner.stages.trainers import ORACLE_FILE, row_critic
 from learner.stages.where2act_adaptation import AdaptationStage
 from learner.stages.where2act_interaction import InteractionStage
 from learner.training.loop import train
@@ -239,7 +238,7 @@ def test_an_oracle_comes_back_and_a_hostile_one_is_refused(trained: Path, datase
     path = trained / "aap" / ORACLE_FILE
     oracle = read_oracle(path, TINY)
     assert isinstance(oracle, OracleCritic)
-    scores = OracleScores(oracle, FrozenFeatures(dataset))(torch.arange(5), torch.arange(0))
+    scores = Teacher.of(oracle, FrozenFeatures(dataset)).scores[:5]
     assert ((scores > 0) & (scores < 1)).all()
     (tmp_path / "cut").write_bytes(path.read_bytes()[:-9])
     with pytest.raises(StoreError, match="safetensors"):

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from learner.data.dataset import load_dataset
 from learner.data.features import FrozenFeatures
-from learner.evaluation.critics import row_critic
 from learner.evaluation.published_mix import PULL_MIX, PUSH_MIX, RowMix, mix_for, shifted_threshold
 from learner.evaluation.table import PRIOR_METHOD, evaluate_store
 from learner.metrics import f_score
+from learner.stages.trainers import row_critic
 from shared.errors import UsageError
 from shared.plan import InteractionRecord, Job, Plan, RolloutRecord
 from shared.policies.policy import Policy
@@ -154,12 +154,13 @@ def test_table_counts_exploits_by_share_apart_from_all_others(tmp_path: Path) ->
             assert prior.share_success == pytest.approx(np.mean([row[2] for row in success]))
             assert sum(prior.counts.share_trials) == 6
         else:
-            assert np.isnan(prior.share_success)
+            assert prior.share_success is None
             assert prior.counts.share_trials == ()
 
 
 def test_table_without_any_success_has_no_figure_of_the_published_mix(tmp_path: Path) -> None:
     store, _ = store_of_queries(tmp_path / "store", "push", successes=False)
     prior = evaluate_store(store, 1, (1,))[0]
-    assert all(np.isnan([prior.mix_f_score, prior.shifted_f_score, prior.mix_base_rate, prior.mix_f_score_low]))
+    figures = (prior.mix_f_score, prior.shifted_f_score, prior.mix_base_rate, prior.mix_f_score_low)
+    assert figures == (None,) * 4
     assert prior.queries > 0

@@ -16,25 +16,19 @@ from learner.data import features
 from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import MOST_ENCODERS, FrozenAap, FrozenFeatures, ProposalPool, frozen_features
 from learner.data.sampling import Batch, order_rows
-from learner.evaluation.comparison import curve_rows, rows_of
 from learner.evaluation.curve import (
     Answers,
     Asked,
     Candidates,
     answer,
+    curve_rows,
     proposal_gains,
+    rows_of,
     tries_by_aip,
     tries_by_information,
 )
 from learner.evaluation.table import NO_TRIES_METHOD, PRIOR_METHOD, evaluate
-from learner.settings import (
-    METRICS_FILE,
-    AapConfig,
-    AffordanceConfig,
-    AipConfig,
-    PriorConfig,
-    TrainingConfig,
-)
+from learner.settings import METRICS_FILE, AapConfig, AffordanceConfig, AipConfig, PriorConfig, TrainingConfig
 from learner.stages import jobs
 from learner.stages.aap import AapStage, OracleStage, SeenRows, predict
 from learner.stages.affordance import AapCritic, AffordanceStage, AipCritic, Critic, PriorCritic
@@ -279,7 +273,7 @@ def test_gains_are_differences_of_the_loss_on_the_same_rows(coin_dataset: Datase
     ordered = order_rows(coin_dataset, [0, 1], 12, np.random.default_rng(0))
     found = stage.gains(ordered)
     with torch.no_grad():
-        logits = predict(policy.aap, SeenRows.of(Batch.of(coin_dataset, ordered), policy.aap.encoder), 3).logits
+        logits = predict(policy.aap, SeenRows.of(Batch.of(coin_dataset, ordered), policy.aap.encoder), 3)[0]
     success = coin_dataset.rows.success[ordered.rows][:, None].expand_as(logits)
     losses = nn.functional.binary_cross_entropy_with_logits(logits, success, reduction="none")[..., 3:].mean(-1)
     torch.testing.assert_close(found.gains[..., 0], losses[:, :-1] - losses[:, 1:], rtol=1e-3, atol=1e-5)

@@ -7,12 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from collector.objects.articulation import joint_motion
-from shared.geometry import (
-    camera_pose,
-    gripper_rotation,
-    quaternion_from_rotation,
-    view_from_world,
-)
+from shared.geometry import camera_pose, gripper_rotation, quaternion_from_rotation, view_from_world
 from shared.plan import covered, missing_jobs
 from shared.seeds import generator, torch_seed
 from tests.support.single_door import door

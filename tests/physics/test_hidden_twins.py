@@ -16,7 +16,7 @@ from collector.objects.readers import read_object
 from collector.objects.writing import write_object
 from collector.random_proposer import RandomProposer
 from collector.sim.environment import SapienEnvironment
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from shared.config import CameraConfig, CollectionConfig
 from shared.geometry import camera_pose, gripper_rotation
 from shared.tasks import Task, task_named

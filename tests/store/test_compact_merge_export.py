@@ -83,17 +83,17 @@ def test_readers_of_overlapping_shards_count_each_rollout_once(tmp_path: Path) -
     for chosen in itertools.chain(itertools.combinations(parts, 2), itertools.combinations(parts, 3)):
         store = make(tmp_path / "-".join(part.path.name for part in chosen))
         store.add_plan(PLAN)
-        store.shards_folder.mkdir()
+        (store.path / "shards").mkdir()
         for part in chosen:
             name = shard_names(part)[0]
-            (part.shards_folder / name).rename(store.shards_folder / name)
+            (part.path / "shards" / name).rename(store.path / "shards" / name)
         rows = rows_of(store)
         assert len(set(rows)) == len(rows)
         assert set(rows) == {row for part in chosen for row in rows_within(sound, part.path.name)}
         assert len(store.rollouts()) * 2 == len(rows)
         for part in chosen:
             name = next(n for n in shard_names(store) if n.endswith(part_suffix(part.path.name)))
-            (store.shards_folder / name).rename(part.shards_folder / name)
+            (store.path / "shards" / name).rename(part.path / "shards" / name)
 
 
 def rows_within(store: Store, name: str) -> list[tuple[int, int]]:

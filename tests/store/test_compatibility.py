@@ -75,7 +75,7 @@ def add_column(shard: Path, file: str, name: str, values: list[Any]) -> None:
 
 
 def shards_of(store: Store) -> list[Path]:
-    return [store.shards_folder / job.shard_id for job in store.jobs()]
+    return [store.path / "shards" / job.shard_id for job in store.jobs()]
 
 
 @pytest.mark.parametrize("name", DIGESTS)

@@ -55,7 +55,7 @@ def store(original: Path, tmp_path: Path) -> Store:
 @pytest.fixture
 def shard(store: Store) -> Path:
     """The copy's first shard."""
-    return store.shards_folder / store.committed()[0].shard_id
+    return store.path / "shards" / store.committed()[0].shard_id
 
 
 def forge(shard: Path, contents: dict[str, bytes], **changes: Any) -> None:
@@ -85,7 +85,7 @@ def refused(act: Callable[[], object], message: str) -> None:
 def test_a_flipped_bit_is_found_wherever_it_is(store: Store) -> None:
     rng = np.random.default_rng(0)
     files = sorted(path for path in store.path.rglob("*") if path.is_file() and not path.name.startswith(".lock-"))
-    files = [path for path in files if path.parent.parent != store.shards_folder or "00000000-" in path.parent.name]
+    files = [path for path in files if path.parent.parent != store.path / "shards" or "00000000-" in path.parent.name]
     assert len(files) > 20
     for path in files:
         sound = path.read_bytes()
@@ -110,7 +110,7 @@ def test_lost_cut_and_foreign_files_are_found(store: Store, shard: Path) -> None
     (shard / "interactions.parquet").write_bytes((shard / "interactions.parquet").read_bytes()[:-1])
     (shard / "notes.txt").write_bytes(b"x")
     (store.path / "notes.txt").write_bytes(b"x")
-    (store.shards_folder / "backup").mkdir()
+    (store.path / "shards" / "backup").mkdir()
     (store.path / "plans" / "aip-v2.json").write_bytes(canonical(PLAN.model_dump(mode="json")))
     (store.path / "policies" / "000001" / "extra").write_bytes(b"x")
     (store.path / "policies" / "latest").mkdir()
@@ -137,7 +137,7 @@ def test_verify_reports_progress_and_missing_plans(store: Store) -> None:
 
 
 def test_a_shard_under_another_name_is_found(store: Store, shard: Path) -> None:
-    shutil.copytree(shard, store.shards_folder / "aip-v1-00000001-00000003")
+    shutil.copytree(shard, store.path / "shards" / "aip-v1-00000001-00000003")
     assert any("belongs to shard" in problem.what for problem in verify(store))
     refused(store.committed, "belongs to shard aip-v1-00000000-00000002")
 
@@ -146,7 +146,7 @@ def test_overlapping_shards_are_found(store: Store, tmp_path: Path) -> None:
     other = Store.create(tmp_path / "other", SETTING)
     job = Job(PLAN.key, 1, 3)
     other.commit(PLAN, job, fabricate_rollouts(PLAN, job), {})
-    shutil.copytree(other.shards_folder / job.shard_id, store.shards_folder / job.shard_id)
+    shutil.copytree(other.path / "shards" / job.shard_id, store.path / "shards" / job.shard_id)
     assert ["holds rollouts that" in problem.what for problem in verify(store)] == [True, True]
 
 
@@ -156,7 +156,7 @@ def test_rollouts_of_another_seed_are_found(store: Store, tmp_path: Path) -> Non
     other = Store.create(tmp_path / "other", setting)
     job = Job(plan.key, 4, 5)
     other.commit(plan, job, fabricate_rollouts(plan, job), {})
-    shutil.copytree(other.shards_folder / job.shard_id, store.shards_folder / job.shard_id)
+    shutil.copytree(other.path / "shards" / job.shard_id, store.path / "shards" / job.shard_id)
     assert ["another object or seed" in problem.what for problem in verify(store)] == [True]
 
 

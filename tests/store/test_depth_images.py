@@ -163,7 +163,7 @@ def test_depth_maps_of_another_camera_are_refused() -> None:
 
 def test_a_manifest_cannot_ask_for_too_many_pixels(tmp_path: Path) -> None:
     store = make(tmp_path / "store", (0, 1))
-    manifest = store.shards_folder / store.jobs()[0].shard_id / "manifest.json"
+    manifest = store.path / "shards" / store.jobs()[0].shard_id / "manifest.json"
     described = without_checksum(manifest.read_bytes(), "it")
     manifest.write_bytes(with_checksum(described | {"depth_size": 1024, "observations": 1 << 10}))
     with pytest.raises(StoreError, match="allowed: 536870912 pixels"):

@@ -186,5 +186,5 @@ def test_the_commands_name_the_place_and_the_error(tmp_path: Path, capsys: pytes
 
 def test_a_file_that_is_missing_for_good_is_damage(tmp_path: Path) -> None:
     store = make(str(tmp_path / "store"))
-    (store.shards_folder / "aip-v1-00000000-00000001" / "rollouts.parquet").unlink()
+    (store.path / "shards" / "aip-v1-00000000-00000001" / "rollouts.parquet").unlink()
     assert [problem.broken for problem in verify(store)] == ["shards/aip-v1-00000000-00000001"]

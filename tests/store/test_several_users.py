@@ -189,7 +189,7 @@ def test_a_machine_of_the_same_name_sweeps_nothing_that_may_be_alive(tmp_path: P
     twin = f"{space[:-12]}{'0' * 12}~4194303~1"
     assert not is_gone(twin)
     assert is_gone(f"{space}~4194303~1")
-    left = store.shards_folder / f".tmp-a~{twin}~abc"
+    left = store.path / "shards" / f".tmp-a~{twin}~abc"
     heartbeat = store.path / "underway" / f"{twin}.json"
     heartbeat.parent.mkdir()
     for file in (left, heartbeat):

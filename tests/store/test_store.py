@@ -226,8 +226,8 @@ def test_what_a_driver_has_vetted_is_not_looked_for_and_counts_once_all_the_same
 
 def test_jobs_are_known_by_name_alone(tmp_path: Path) -> None:
     store = make(tmp_path / "store", (0, 2), (4, 7))
-    (store.shards_folder / Job(PLAN.key, 2, 4).shard_id).mkdir()
-    (store.shards_folder / Job(PLAN.key, 0, 2).shard_id / "manifest.json").write_text("damaged")
+    (store.path / "shards" / Job(PLAN.key, 2, 4).shard_id).mkdir()
+    (store.path / "shards" / Job(PLAN.key, 0, 2).shard_id / "manifest.json").write_text("damaged")
     assert store.jobs() == store.jobs(PLAN.key) == [Job(PLAN.key, 0, 2), Job(PLAN.key, 4, 7)]
     assert store.jobs("aip-v1") == []
 
@@ -370,7 +370,7 @@ def test_rows_find_their_clouds(tmp_path: Path) -> None:
 
 def test_a_shard_opens_in_plain_zarr_and_parquet(tmp_path: Path) -> None:
     store = make(tmp_path / "store", (0, 2))
-    shard = store.shards_folder / store.committed()[0].shard_id
+    shard = store.path / "shards" / store.committed()[0].shard_id
     rollouts = fabricate_rollouts(PLAN, Job(PLAN.key, 0, 2))
     clouds = zarr.open_group(shard / "observations.zarr", mode="r")
     points = clouds["points"][...]

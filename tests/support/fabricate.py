@@ -194,12 +194,12 @@ def fabricate_store(path: Path, shards: int, rollouts: int = 2, points: int = 64
     plan, store = Plan(setting=setting), Store.create(path, setting)
     job = Job(plan.key, 0, rollouts)
     first = store.commit(plan, job, fabricate_rollouts(plan, job, interactions, interactions), {})
-    clouds = {name: (store.shards_folder / first.shard_id / name) for name in first.files if "/" in name}
+    clouds = {name: (store.path / "shards" / first.shard_id / name) for name in first.files if "/" in name}
     made = store.read_rollouts(first.shard_id)
     content = first.model_dump(mode="json")
     for number in range(1, shards):
         job = Job(plan.key, number * rollouts, (number + 1) * rollouts)
-        folder = store.shards_folder / job.shard_id
+        folder = store.path / "shards" / job.shard_id
         records = [dataclasses.replace(one, index=job.start + k) for k, one in enumerate(made)]
         heads = [RolloutRow(one, k) for k, one in enumerate(records)]
         rows = [InteractionRow(one, each, k) for k, one in enumerate(records) for each in one.interactions]

@@ -3,8 +3,7 @@
 import numpy as np
 
 from collector.objects.articulation import ArticulatedObject, joint_twist
-from collector.sim.simulator import PrivilegedState, Simulator
-from collector.stopwatch import StageClock
+from collector.sim.simulator import PrivilegedState, Simulator, StageClock
 from shared.config import CollectionConfig
 from shared.extensions import Registry
 from shared.tasks import Task

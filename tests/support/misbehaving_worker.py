@@ -7,7 +7,7 @@ import signal
 from collections.abc import Mapping
 from pathlib import Path
 
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from collector.worker import Worker
 from shared.plan import Plan, RolloutRecord
 from tests.support.fabricate import fabricate_rollout

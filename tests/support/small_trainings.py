@@ -8,13 +8,7 @@ import torch
 
 from learner.data.dataset import Dataset
 from learner.data.sampling import Split
-from learner.settings import (
-    AapConfig,
-    AffordanceConfig,
-    AipConfig,
-    LearnerConfig,
-    PriorConfig,
-)
+from learner.settings import AapConfig, AffordanceConfig, AipConfig, LearnerConfig, PriorConfig
 from learner.training.loop import Stage, StepResult
 from shared.plan import Job, Plan, RolloutRecord
 from shared.store.store import Store

@@ -14,7 +14,7 @@ from collector.random_proposer import RandomProposer, RepeatingProposer
 from collector.recorder import interact
 from collector.rollout import draw_dynamics, draw_rollout, make_environment, object_of
 from collector.sim.environment import SAME_STATE, SapienEnvironment, only_sapien
-from collector.stopwatch import StageClock
+from collector.sim.simulator import StageClock
 from shared import seeds
 from shared.plan import Plan
 from shared.progress import Advance

@@ -17,8 +17,8 @@ from collector.rollout import Draw, draw_rollout, make_environment, object_of
 from collector.sim.environment import only_sapien
 from collector.sim.restoration import first_positions
 from collector.sim.scene import Scene
+from collector.sim.simulator import StageClock
 from collector.sim.trial import MOTION_THRESHOLD, Trial
-from collector.stopwatch import StageClock
 from learner.metrics import ratio_interval
 from shared import seeds
 from shared.config import Fidelity

@@ -88,8 +88,7 @@ def _judge(command: CurveCommand, runs: dict[str, list[Path]]) -> "Curves":
     from learner.alternation import trained_in
     from learner.data.dataset import load_dataset
     from learner.data.features import FrozenFeatures
-    from learner.evaluation.comparison import curve_rows
-    from learner.evaluation.curve import Candidates
+    from learner.evaluation.curve import Candidates, curve_rows
     from learner.stages.jobs import objects_seen, read_policy_folder
     from learner.stages.trainers import ORACLE_FILE
     from shared.store.store import Store

@@ -9,7 +9,7 @@ import tyro
 from cluster.config.command_settings import EvaluateSettings
 from cluster.config.flags import parse_flags
 from shared.errors import UsageError
-from shared.policies.methods import method_named
+from shared.policies.methods import METHODS
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ def main(args: list[str]) -> int:
     if command.settings.task is not None:
         _ = command.settings.task_record
     for method in command.settings.methods:
-        method_named(method)
+        METHODS.get(method)
     from cluster.evaluation.run_evaluation import evaluate_run, evaluate_without_run
 
     if command.run is not None:

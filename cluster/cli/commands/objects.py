@@ -201,7 +201,7 @@ def _import(command: ImportCommand) -> int:
     before = f"before, {extent}"
     after = f"after, front {placement.front}, up {placement.up}"
     contact_sheet([made.before, made.after], sheet, titles=[before, after])
-    movable = _parts(len(made.after.parts))
+    movable = counted(len(made.after.parts), "movable part")
     print(plain("; ".join([f"{folder.name}  usable: {made.after.ref.category}, {movable}", *made.notes])))
     for body in made.after.parts:
         assert body.joint is not None
@@ -255,7 +255,7 @@ def _check(command: CheckCommand) -> int:
         line = described[object_id]
         if object_id in entries:
             entry = entries[object_id]
-            line = "; ".join([f"usable: {entry.ref.category}, {_parts(entry.movable)}", *entry.notes])
+            line = "; ".join([f"usable: {entry.ref.category}, {counted(entry.movable, 'movable part')}", *entry.notes])
             if command.settle:
                 rests, draws = _draws_at_rest(entry, command.task)
                 line += f"; comes to rest in {rests or 'none'} of {draws} draws"
@@ -348,10 +348,6 @@ def _scenes(command: ScenesCommand) -> int:
         made = make_scenes(command.path, command.out, command.count, command.seed, command.noise, progress.show)
     print(plain(f"{command.out}: {made.count} scenes of {len(made.objects)} objects"))
     return 0
-
-
-def _parts(count: int) -> str:
-    return f"{count} movable part{'' if count == 1 else 's'}"
 
 
 ACTIONS: dict[str, Action] = {

@@ -85,7 +85,7 @@ def _show(command: ReplayCommand, out: Path) -> int:
 
 
 def _replay_job(command: ReplayCommand) -> int:
-    from collector.stopwatch import StageClock
+    from collector.sim.simulator import StageClock
     from collector.worker import Worker
     from shared.store import Store
 

@@ -9,7 +9,7 @@ import tyro
 from cluster.config.campaign_config import CampaignConfig
 from cluster.config.flags import early_flags, layered, parse_flags
 from shared.errors import UsageError
-from shared.policies.methods import method_named
+from shared.policies.methods import METHODS
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ def main(args: list[str]) -> int:
     command = parse_flags(RunCommand, args, "run", defaults)
     _ = command.settings.task_record
     for method in command.settings.evaluation.methods:
-        method_named(method)
+        METHODS.get(method)
     if command.settings.learner.baselines:
         from learner.stages.trainers import check_baselines
 

@@ -10,9 +10,8 @@ from pydantic_core import from_json
 
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.bounds import check_bounds
-from collector.objects.importing.layouts import Source, read_urdf
+from collector.objects.importing.layouts import Source, SourceFiles, read_urdf
 from collector.objects.importing.placement import Placement, opening_upwards, settled
-from collector.objects.importing.sources import SourceFiles
 from collector.objects.model import ObjectModel, bodies_of, bounding_box, model_of
 from collector.objects.partnet import META_FILE
 from collector.objects.readers import Description, read_object

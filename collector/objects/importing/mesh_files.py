@@ -6,8 +6,7 @@ import numpy as np
 
 from collector.objects import meshes
 from collector.objects.articulation import Mesh
-from collector.objects.child_process import ChildProcess
-from collector.objects.mesh_bytes import decode
+from collector.objects.child_process import ChildProcess, decode
 from shared.errors import ObjectError
 from shared.extras import require_packages
 from shared.io.text import plain

@@ -1,7 +1,7 @@
 """A process that reads meshes by trimesh, one after another, until its standard input ends.
 
 A question is the file's ending (8 bytes, blanks at its end) and the file. An answer is "m" and a list of meshes
-(`collector.objects.mesh_bytes`), or "e" and what is wrong. Files come from anybody, and the readers have no bounds of
+(`encode`), or "e" and what is wrong. Files come from anybody, and the readers have no bounds of
 their own, so they run in a process that has: on memory and on time.
 """
 
@@ -16,9 +16,8 @@ import numpy as np
 import trimesh
 
 from collector.objects.articulation import Mesh
-from collector.objects.child_process import answer_all
+from collector.objects.child_process import answer_all, encode
 from collector.objects.importing.mesh_files import ENDING_BYTES
-from collector.objects.mesh_bytes import encode
 from collector.objects.meshes import MAX_OBJ_BYTES
 
 MAX_MEMORY = 4 << 30

@@ -17,9 +17,8 @@ import numpy as np
 
 from collector.objects import meshes
 from collector.objects.articulation import Body, Joint, Mesh
-from collector.objects.importing.layouts import UNKNOWN_CATEGORY
+from collector.objects.importing.layouts import UNKNOWN_CATEGORY, SourceFiles
 from collector.objects.importing.mesh_files import MeshParser, capsule
-from collector.objects.importing.sources import SourceFiles
 from collector.objects.readers import Description
 from collector.objects.urdf_bodies import MAX_OBJECT_TRIANGLES, MAX_OBJECT_VERTICES, listed
 from shared.errors import ObjectError

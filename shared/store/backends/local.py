@@ -21,15 +21,15 @@ from shared.io.files import (
     write_atomically,
     write_durably,
 )
-from shared.store.backends.base import Transaction
+from shared.store.backends.base import StorageBackend, Transaction
 from shared.store.layout import LOCK_PREFIX
 
 _LOCK_WAIT_S = 60.0
 """Locks are held for milliseconds; one that lasts longer means a hung disk."""
 
 
-class LocalBackend:
-    """See `shared.store.backends.base.StorageBackend`."""
+class LocalBackend(StorageBackend):
+    """A folder of a disk."""
 
     writes_in_place = False
 
@@ -38,7 +38,6 @@ class LocalBackend:
         self.where = str(root)
 
     def is_there(self) -> bool:
-        """See `StorageBackend.is_there`."""
         return stat.S_ISDIR(_mode(self.root))
 
     def read(self, key: str, limit: int) -> bytes:
@@ -51,19 +50,15 @@ class LocalBackend:
         return read_bounded(self._at(key), limit)
 
     def read_all(self, wanted: Sequence[tuple[str, int]]) -> Iterator[bytes]:
-        """See `StorageBackend.read_all`."""
         return (self.read(key, limit) for key, limit in wanted)
 
     def exists(self, key: str) -> bool:
-        """See `StorageBackend.exists`."""
         return _mode(self._at(key)) != 0
 
     def exist(self, keys: Sequence[str]) -> Iterator[bool]:
-        """See `StorageBackend.exist`."""
         return map(self.exists, keys)
 
     def names(self, folder: str) -> list[str]:
-        """See `StorageBackend.names`."""
         path = self._at(folder)
         if not stat.S_ISDIR(_mode(path)):
             return []
@@ -77,7 +72,6 @@ class LocalBackend:
         return (name for name in self.names(folder) if name >= first)
 
     def leaves(self, folder: str) -> list[str]:
-        """See `StorageBackend.leaves`."""
         found = []
         left = [folder] if stat.S_ISDIR(_mode(self._at(folder))) else []
         while left:
@@ -91,7 +85,6 @@ class LocalBackend:
         return sorted(found)
 
     def create(self, key: str, data: bytes) -> bool:
-        """See `StorageBackend.create`."""
         path = self._at(key)
         if _mode(path):
             return False
@@ -99,17 +92,14 @@ class LocalBackend:
         return create_exclusively(path, data)
 
     def replace(self, key: str, data: bytes) -> None:
-        """See `StorageBackend.replace`."""
         path = self._at(key)
         path.parent.mkdir(exist_ok=True)
         write_atomically(path, data)
 
     def remove(self, key: str) -> None:
-        """See `StorageBackend.remove`."""
         self._at(key).unlink(missing_ok=True)
 
     def publish(self, transaction: Transaction) -> bool:
-        """See `StorageBackend.publish`."""
         final = self._at(transaction.folder)
         final.parent.mkdir(exist_ok=True)
         temporary = final.parent / temporary_name(final.name)
@@ -121,7 +111,6 @@ class LocalBackend:
             remove_tree(temporary)
 
     def move(self, key: str, new: str) -> None:
-        """See `StorageBackend.move`."""
         old, target = self._at(key), self._at(new)
         if not _mode(old, follow=False):
             return
@@ -131,7 +120,6 @@ class LocalBackend:
         sync_folder(old.parent)
 
     def sweep(self, folders: Sequence[str]) -> int:
-        """See `StorageBackend.sweep`."""
         remnants = [
             self._at(folder) / name
             for folder in folders
@@ -142,7 +130,6 @@ class LocalBackend:
 
     @contextmanager
     def only_one(self, name: str, *, alone: bool = False) -> Iterator[None]:
-        """See `StorageBackend.only_one`."""
         with ExitStack() as held:
             try:
                 held.enter_context(exclusive_lock(self.root / f"{LOCK_PREFIX}{name}"))

@@ -20,7 +20,7 @@ from obstore.store import S3Store
 
 from shared.errors import MissingError, StoreError, UnreadableError, UsageError
 from shared.io.redaction import without_secrets
-from shared.store.backends.base import URL_SCHEME, Transaction
+from shared.store.backends.base import URL_SCHEME, StorageBackend, Transaction
 from shared.store.presence import present
 
 AT_ONCE = 16
@@ -45,8 +45,8 @@ _CREDENTIALS = (
 Answer = TypeVar("Answer")
 
 
-class S3Backend:
-    """See `shared.store.backends.base.StorageBackend`."""
+class S3Backend(StorageBackend):
+    """A prefix of a bucket."""
 
     writes_in_place = True
 
@@ -86,8 +86,6 @@ class S3Backend:
         return True
 
     def read(self, key: str, limit: int) -> bytes:
-        """See `StorageBackend.read`."""
-
         def get() -> bytes:
             answer = self._client.get(key)
             if answer.meta["size"] > limit:
@@ -99,13 +97,11 @@ class S3Backend:
         return self._ask(get, key)
 
     def read_all(self, wanted: Sequence[tuple[str, int]]) -> Iterator[bytes]:
-        """See `StorageBackend.read_all`."""
         if len(wanted) < 2:
             return (self.read(key, limit) for key, limit in wanted)
         return self._map(lambda pair: self.read(*pair), wanted)
 
     def exists(self, key: str) -> bool:
-        """See `StorageBackend.exists`."""
         try:
             self._ask(lambda: self._client.head(key), key, missing_is_error=False)
         except FileNotFoundError:
@@ -113,11 +109,9 @@ class S3Backend:
         return True
 
     def exist(self, keys: Sequence[str]) -> Iterator[bool]:
-        """See `StorageBackend.exist`."""
         return self._map(self.exists, keys)
 
     def names(self, folder: str) -> list[str]:
-        """See `StorageBackend.names`."""
         found = self._ask(lambda: self._client.list_with_delimiter(folder or None), folder)
         keys = [*found["common_prefixes"], *(entry["path"] for entry in found["objects"])]
         return sorted({key.rstrip("/").rpartition("/")[2] for key in keys})
@@ -134,12 +128,10 @@ class S3Backend:
                 last = name
 
     def leaves(self, folder: str) -> list[str]:
-        """See `StorageBackend.leaves`."""
         pages = self._ask(lambda: list(self._client.list(folder or None, chunk_size=PAGE)), folder)
         return sorted(entry["path"] for page in pages for entry in page)
 
     def create(self, key: str, data: bytes) -> bool:
-        """See `StorageBackend.create`."""
         try:
             # One request each: a multipart upload could not be conditional with every server.
             self._ask(lambda: self._client.put(key, data, mode="create", use_multipart=False), key)
@@ -148,7 +140,6 @@ class S3Backend:
         return True
 
     def replace(self, key: str, data: bytes) -> None:
-        """See `StorageBackend.replace`."""
         self._ask(lambda: self._client.put(key, data, use_multipart=False), key)
 
     def upload(self, key: str, path: Path) -> None:
@@ -156,14 +147,12 @@ class S3Backend:
         self._ask(lambda: self._client.put(key, path), key)
 
     def remove(self, key: str) -> None:
-        """See `StorageBackend.remove`."""
         try:
             self._ask(lambda: self._client.delete(key), key, missing_is_error=False)
         except FileNotFoundError:
             return
 
     def publish(self, transaction: Transaction) -> bool:
-        """See `StorageBackend.publish`."""
         folder, mark = transaction.folder, f"{transaction.folder}/{transaction.mark}"
         transaction.check()
 

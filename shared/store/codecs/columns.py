@@ -5,7 +5,7 @@ import json
 import operator
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
@@ -79,14 +79,13 @@ class Column(Generic[Row]):
     value: Callable[[Row], Any]
     content: bool = True
     default: Any = None
+    allowed: type[StrEnum] | None = None
+    longest: int = MAX_TEXT
+    finite: bool = True
 
     def __post_init__(self) -> None:
         """Hold a column that was added to what older software can verify."""
         assert self.default is None or not self.content, f"{self.name} has a default, so it must be no content"
-
-    allowed: type[StrEnum] | None = None
-    longest: int = MAX_TEXT
-    finite: bool = True
 
     @property
     def arrow_type(self) -> Any:
@@ -320,17 +319,9 @@ def _outcome_columns() -> tuple[Column[InteractionRow], ...]:
     )
 
 
-def _of_rollout(column: Column[RolloutRow]) -> Column[InteractionRow]:
+def _of_rollout(column: Column[Any]) -> Column[Any]:
     """The same column in interactions.parquet, for rows that are read alone; a copy, so not content."""
-    return Column(
-        column.name,
-        column.dtype,
-        column.width,
-        column.description,
-        lambda row: column.value(RolloutRow(row.rollout, row.first_observation)),
-        content=False,
-        allowed=column.allowed,
-    )
+    return replace(column, value=lambda x: column.value(RolloutRow(x.rollout, x.first_observation)), content=False)
 
 
 def fingerprint(*tables: Sequence[Column[Any]]) -> str:

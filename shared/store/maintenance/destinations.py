@@ -96,8 +96,8 @@ def destination(out: str | Path) -> Destination:
     return DiskDestination(Path(out))
 
 
-class DiskDestination:
-    """See `Destination`."""
+class DiskDestination(Destination):
+    """A folder of a disk."""
 
     def __init__(self, out: Path) -> None:
         if os.path.lexists(out) and not (out / NOTES / BEGUN).is_file():
@@ -108,7 +108,6 @@ class DiskDestination:
 
     @contextmanager
     def begin(self, identity: dict[str, Any]) -> Iterator[None]:
-        """See `Destination.begin`."""
         folder, notes = self.folder, self._notes
         if os.path.lexists(self._out):
             # It was killed after it had its name, and before its notes were gone.
@@ -133,24 +132,19 @@ class DiskDestination:
             yield
 
     def note(self, name: str) -> dict[str, Any] | None:
-        """See `Destination.note`."""
         return _note(self._notes / name)
 
     def add_note(self, name: str, note: Mapping[str, Any]) -> None:
-        """See `Destination.add_note`."""
         write_atomically(self._notes / name, json.dumps(note).encode())
 
     def has(self, files: Mapping[str, int]) -> bool:
-        """See `Destination.has`."""
         paths = {self.folder / name: size for name, size in files.items()}
         return all(path.is_file() and path.stat().st_size == size for path, size in paths.items())
 
     def piece(self) -> Path:
-        """See `Destination.piece`."""
         return _emptied(self._notes / _PIECE)
 
     def take(self, aside: Path) -> dict[str, int]:
-        """See `Destination.take`."""
         files = {}
         for path in _files(aside):
             name = path.relative_to(aside)
@@ -162,7 +156,6 @@ class DiskDestination:
         return files
 
     def complete(self) -> None:
-        """See `Destination.complete`."""
         # It names this machine. The other notes stay until the folder has its name: a kill here loses nothing.
         (self._notes / DRIVER_LOCK).unlink()
         self.folder.rename(self._out)
@@ -170,13 +163,12 @@ class DiskDestination:
         sync_folder(self._out.parent)
 
     def on_error(self, error: OSError) -> UsageError:
-        """See `Destination.on_error`."""
         left = f"; what is finished is in {self.folder}: {_GO_ON}" if self.folder.is_dir() else ""
         return UsageError(f"{self._out}: cannot be written ({_reason(error)}){left}, or name another folder")
 
 
-class BucketDestination:
-    """See `Destination`. A piece is written to the temporary folder of this machine, and then goes to the bucket."""
+class BucketDestination(Destination):
+    """A prefix of a bucket. A piece is written to the temporary folder of this machine, and then goes to the bucket."""
 
     def __init__(self, out: str) -> None:
         from shared.store.backends.s3 import S3Backend
@@ -190,7 +182,6 @@ class BucketDestination:
 
     @contextmanager
     def begin(self, identity: dict[str, Any]) -> Iterator[None]:
-        """See `Destination.begin`."""
         with scratch_folder("export") as staging, present(self._notes, "export", alone=True):
             self._staging, self.folder = staging, staging / "out"
             self.folder.mkdir()
@@ -202,7 +193,6 @@ class BucketDestination:
             yield
 
     def note(self, name: str) -> dict[str, Any] | None:
-        """See `Destination.note`."""
         try:
             return parse_object(self._notes.read(name, MAX_DOCUMENT_BYTES), f"{self._notes.where}/{name}")
         except UnreadableError:
@@ -211,12 +201,11 @@ class BucketDestination:
             return None
 
     def add_note(self, name: str, note: Mapping[str, Any]) -> None:
-        """See `Destination.add_note`."""
         with _going_on():
             self._notes.replace(name, json.dumps(note).encode())
 
     def has(self, files: Mapping[str, int]) -> bool:
-        """See `Destination.has`; an object of a bucket is whole or not there."""
+        # An object of a bucket is whole or not there.
         if not all(self._backend.exist(list(files))):
             return False
         for name, size in files.items():
@@ -224,11 +213,9 @@ class BucketDestination:
         return True
 
     def piece(self) -> Path:
-        """See `Destination.piece`."""
         return _emptied(self._staging / _PIECE)
 
     def take(self, aside: Path) -> dict[str, int]:
-        """See `Destination.take`."""
         files = {}
         for path in _files(aside):
             name = str(path.relative_to(aside))
@@ -239,7 +226,6 @@ class BucketDestination:
         return files
 
     def complete(self) -> None:
-        """See `Destination.complete`."""
         for path in _files(self.folder):
             name = str(path.relative_to(self.folder))
             if name not in self._taken:
@@ -250,7 +236,6 @@ class BucketDestination:
                 self._notes.remove(name)
 
     def on_error(self, error: OSError) -> UsageError:
-        """See `Destination.on_error`."""
         return UsageError(
             f"{self._out}: cannot be written through the temporary folder ({_reason(error)}), which TMPDIR names; "
             f"what is finished is in the bucket: {_GO_ON}"
