@@ -23,6 +23,7 @@ from cluster.cli.commands import bench
 from cluster.workers import ray_process, session
 from cluster.workers.session import ray_session
 from shared.errors import UsageError, WorkerError
+from shared.interrupts import undisturbed
 from shared.io import private
 
 ROOT = Path(__file__).parents[2]
@@ -405,7 +406,7 @@ def test_a_session_may_end_in_a_thread_where_no_signals_are_handled() -> None:
     done: list[bool] = []
 
     def end() -> None:
-        with session._undisturbed():
+        with undisturbed():
             done.append(True)
 
     thread = threading.Thread(target=end)
