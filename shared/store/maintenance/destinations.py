@@ -24,6 +24,7 @@ from shared.io.files import (
     scratch_folder,
     sync_file,
     sync_folder,
+    sync_tree,
     write_atomically,
 )
 from shared.store.backends.base import backend_of, is_url
@@ -163,6 +164,7 @@ class DiskDestination:
 
     def complete(self) -> None:
         """See `Destination.complete`."""
+        sync_tree(self.folder)
         # It names this machine. The other notes stay until the folder has its name: a kill here loses nothing.
         (self._notes / DRIVER_LOCK).unlink()
         self.folder.rename(self._out)
