@@ -155,7 +155,7 @@ def ray_session(workers: int, address: str | None = None) -> Iterator[None]:
     """
     on_terminate = signal.getsignal(signal.SIGTERM)
     with _private_session(workers) if address is None else _cluster(address):
-        # Ray has put a handler of its own in place of ours.
+        # Ray's native part has put a handler of its own in place of ours.
         signal.signal(signal.SIGTERM, on_terminate)
         yield
 
@@ -443,19 +443,23 @@ def _set_environment(values: Mapping[str, str | None]) -> None:
 
 @contextmanager
 def _ray() -> Iterator[Any]:
-    """Ray, made quiet, while it starts; what it has kept of the environment is read anew."""
+    """Ray, made quiet, while it starts; what it has kept of the environment is read anew.
+
+    Its Python part puts no handler in place of ours, which would end this process without a word while Ray starts.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ray's own deprecations; a user can do nothing about them.
         with ray_process.without_slow_imports():
             import ray
         from ray import _raylet
-        from ray._private import worker
+        from ray._private import utils, worker
 
         native: Any = _raylet
         worker.print_to_stdstream = _to_log
         native.Config.initialize("")
         native.AuthenticationTokenLoader.instance().reset_cache()
-        yield ray
+        with _changed_attributes(utils, {"set_sigterm_handler": lambda handler: None}):
+            yield ray
 
 
 def _to_log(data: dict[str, Any], ignore_prefix: bool = False) -> None:
