@@ -5,13 +5,19 @@ since `cluster` is a name that others have, too. That package is not imported st
 Python needs none of it.
 """
 
+import sys
 from importlib import import_module
 from typing import NoReturn
 
 
 def main() -> NoReturn:
     """Run the command line of this process and exit."""
-    import_module("cluster.cli.main").main()
+    try:
+        import_module("cluster.cli.main").main()
+    except KeyboardInterrupt:
+        # While it was imported, before it heeds signals; nothing was begun.
+        print("adaafford: interrupted", file=sys.stderr)
+        sys.exit(130)
     raise AssertionError("the command line ends the process")
 
 

@@ -29,7 +29,7 @@ from adaafford.parts import FollowedPart, part_choice
 from adaafford.scans import ScanFrame, Vector, action_at
 from shared.config import StrictModel
 from shared.errors import UsageError
-from shared.io.documents import named_twice
+from shared.io.documents import named_twice, reason_of
 from shared.io.files import read_bounded, remove_remnants, write_atomically, writing
 from shared.types import MAX_GRASP_WIDTH, Action, Interaction, Observation, Outcome, OutcomeKind
 
@@ -224,7 +224,7 @@ def parse_json(model: type[Model], data: bytes, source: str, remedy: str) -> Mod
     except ValidationError as error:
         problem = error.errors()[0]
         place = shown([".".join(map(str, problem["loc"]))]) if problem["loc"] else "the file"
-        raise UsageError(f"{source}{place}: {problem['msg'][:150]}; {remedy}") from None
+        raise UsageError(f"{source}{place}: {reason_of(problem)[:150]}; {remedy}") from None
     except ValueError as error:
         raise UsageError(f"{source}{error}; {remedy}") from None
     return found

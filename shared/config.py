@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError, m
 from shared.errors import UsageError
 from shared.extensions import Registry
 from shared.hidden import ALWAYS_DRAWN, HIDDEN_PARAMETERS, NAME, HiddenParameter, hidden_parameter
-from shared.io.documents import MAX_PROBLEMS
+from shared.io.documents import MAX_PROBLEMS, reason_of
 from shared.io.files import read_named
 from shared.io.text import MAX_WORD, plain
 from shared.types import Order
@@ -28,8 +28,6 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")]
 """Of something that a registry finds (`shared.extensions`); it stands in flags, file names and keys of plans. A store
 can be read where the package is not installed."""
 PANDA, SAPIEN = "panda", "sapien"
-VALUE_ERROR = "Value error, "
-"""What pydantic puts before the message of a check."""
 
 
 class StrictModel(BaseModel):
@@ -352,8 +350,8 @@ def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
         hint = f"did you mean '{close[0]}'?" if close else f"allowed here: {', '.join(known)}"
         return f"unknown setting '{name}'; {hint}{more}"
     if problem["type"] == "value_error":  # Of a check of ours, which says what was given.
-        return f"setting '{name}': {problem['msg'].removeprefix(VALUE_ERROR)}{more}"
-    return f"setting '{name}': {problem['msg']}; given {_shown(problem['input'])}{more}"
+        return f"setting '{name}': {reason_of(problem)}{more}"
+    return f"setting '{name}': {reason_of(problem)}; given {_shown(problem['input'])}{more}"
 
 
 def _shown(value: object) -> str:

@@ -18,6 +18,7 @@ import adaafford  # noqa: F401 - it sees first that nothing shadows our packages
 from cluster.runs.streams import Streams, configure
 from shared.errors import AdaAffordError, UsageError
 from shared.extras import extra_of, missing_line, require
+from shared.interrupts import ENDING
 from shared.io.redaction import without_secrets
 from shared.io.text import plain
 
@@ -28,8 +29,6 @@ SPINS = 30_000
 speed on a quiet machine, and its fair share of a busy one."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as a shell has it."""
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals by which users end a command."""
 
 COMMANDS = {
     "run": "a whole campaign: collect, train, collect proposed interactions, evaluate",
@@ -85,14 +84,19 @@ def main() -> NoReturn:
     args = sys.argv[1:]
     streams = begin_process(stop_at_pipe=only_prints(args))
     try:
-        code = run(args)
+        try:
+            code = _run(args)
+        finally:
+            # A second signal must not interrupt the report of the first.
+            for number in ENDING:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    signal.signal(number, _pass_over)
+    except KeyboardInterrupt:
+        code = _interrupted(args)
     except _Ended as ended:
         code = _interrupted(args, 128 + ended.number)
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else _complain(str(stop.code), 1) if stop.code else 0
-    except KeyboardInterrupt:
-        # Another one, while the first was being reported.
-        code = INTERRUPTED
     # All is done and said, so that a signal may end the process at once, without a traceback.
     for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -134,6 +138,10 @@ def begin_process(*, stop_at_pipe: bool = False) -> Streams:
 
 def run(args: list[str]) -> int:
     """Run one command line; returns its exit code."""
+    return guarded(lambda: _run(args), args)
+
+
+def _run(args: list[str]) -> int:
     if not args or args[0] in ("-h", "--help"):
         print(USAGE)
         return 0 if args else 2
@@ -150,16 +158,24 @@ def run(args: list[str]) -> int:
         code: int = import_module(f"cluster.cli.commands.{name.replace('-', '_')}").main(rest)
         return code
 
-    return guarded(command, args)
+    return _told(command, args)
 
 
 def guarded(command: Callable[[], int], args: list[str]) -> int:
-    """Run a subcommand; what it raises becomes one line and an exit code.
+    """Run a subcommand; what it raises, and Ctrl-C, becomes one line and an exit code.
 
     Args:
         command: returns its exit code.
         args: the command line that it came from.
     """
+    try:
+        return _told(command, args)
+    except KeyboardInterrupt:
+        return _interrupted(args)
+
+
+def _told(command: Callable[[], int], args: list[str]) -> int:
+    """See `guarded`; Ctrl-C is raised."""
     try:
         code = command()
         sys.stdout.flush()
@@ -169,8 +185,6 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
         if extra_of(error.name) is None:
             raise
         return _complain(missing_line(f"adaafford {args[0]} here", str(error.name)), UsageError.exit_code)
-    except KeyboardInterrupt:
-        return _interrupted(args)
     except OSError as error:
         logger.info("what the system refused", exc_info=True)
         place = f"{error.filename}: " if error.filename else ""
@@ -188,6 +202,10 @@ class _Ended(SystemExit):
 
 def _end(number: int, frame: object) -> NoReturn:
     raise _Ended(number)
+
+
+def _pass_over(number: int, frame: object) -> None:
+    """The command is ending already."""
 
 
 def _interrupted(args: list[str], code: int = INTERRUPTED) -> int:

@@ -21,8 +21,9 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
-from shared.config import VALUE_ERROR, CollectionConfig, DynamicsRanges, Name, load_toml, merge, parse
+from shared.config import CollectionConfig, DynamicsRanges, Name, load_toml, merge, parse
 from shared.errors import UsageError
+from shared.io.documents import VALUE_ERROR, reason_of
 
 PRESETS_FOLDER = Path(__file__).parent / "presets"
 
@@ -185,7 +186,7 @@ def parse_flags(
         if isinstance(cause := problem.get("ctx", {}).get("error"), UsageError):
             raise cause from None
         name = ".".join(str(part) for part in problem["loc"])
-        raise UsageError(f"flag for '{name}': {problem['msg']}; given {str(problem['input'])[:80]!r}") from None
+        raise UsageError(f"flag for '{name}': {reason_of(problem)}; given {str(problem['input'])[:80]!r}") from None
     assert parsed is not None
     return parsed
 

@@ -18,6 +18,7 @@ from typing import Any
 
 from shared.errors import UsageError
 from shared.heartbeat import Heartbeat
+from shared.io.files import sync_folder
 
 BEAT_S, BEAT_SHARE = 5.0, 0.01
 """A stage under way is noted after so many seconds, or after this share of what the attempt has spent on it if that is
@@ -92,11 +93,14 @@ class RunLog:
         """Append one event, durably."""
         line = json.dumps({"time": round(time.time(), 3), "event": event, **details}, allow_nan=False)
         with self._lock:
-            torn = self._path.exists() and not _ends_with_newline(self._path)
+            known = self._path.exists()
+            torn = known and not _ends_with_newline(self._path)
             with self._path.open("a", encoding="utf-8") as file:
                 file.write(f"\n{line}\n" if torn else f"{line}\n")
                 file.flush()
                 os.fsync(file.fileno())
+            if not known:
+                sync_folder(self._path.parent)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Callable[[Mapping[str, Any]], None]]:

@@ -11,7 +11,6 @@ import secrets
 import signal
 import socket
 import subprocess
-import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -27,6 +26,7 @@ from collector.job_result import WorkerFactory
 from collector.watchdog import Limits
 from shared.errors import StoreError, UsageError, WorkerError
 from shared.extras import require_packages
+from shared.interrupts import undisturbed
 from shared.io.files import is_gone, process_name, read_bounded, remove_if_abandoned, remove_tree, temporary_name
 from shared.io.private import private_folder
 from shared.store import Store
@@ -75,8 +75,6 @@ _SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 """How a connection of HTTP/2 begins: the client's preface, and a frame of settings, here of none."""
 _SHARED_MEMORY = Path("/dev/shm")  # noqa: S108
 _OWNER_FILE = "owner"
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals by which users end a command."""
 
 WorkerGroupMaker = Callable[[WorkerFactory, CrashLog], WorkerGroup]
 """Makes a worker group from a worker factory and the crash log for its heartbeats."""
@@ -157,7 +155,7 @@ def ray_session(workers: int, address: str | None = None) -> Iterator[None]:
     """
     on_terminate = signal.getsignal(signal.SIGTERM)
     with _private_session(workers) if address is None else _cluster(address):
-        # Ray has put a handler of its own in place of ours.
+        # Ray's native part has put a handler of its own in place of ours.
         signal.signal(signal.SIGTERM, on_terminate)
         yield
 
@@ -267,14 +265,14 @@ def _started_session(workers: int, *, lean: bool) -> Iterator[None]:
             try:
                 _start_on_loopback(workers, folder, lean=lean)
             except BaseException:  # An interrupt, too.
-                with _undisturbed():
+                with undisturbed():
                     ray.shutdown()
                     _kill(set(psutil.Process().children(recursive=True)) - set(others))
                 raise
         try:
             yield
         finally:
-            with _undisturbed():
+            with undisturbed():
                 processes = _processes_of_ray()
                 ray.shutdown()
                 psutil.wait_procs(processes, AGENTS_S)
@@ -398,31 +396,8 @@ def _session_folder() -> Iterator[Path]:
     try:
         yield folder
     finally:
-        with _undisturbed():
+        with undisturbed():
             _remove_session(folder)
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Signals that would end this process wait for the end of the context, so that a second Ctrl-C leaves nothing.
-
-    In the main thread, where Python handles signals; elsewhere none interrupts.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    received: list[int] = []
-    handlers = {number: signal.getsignal(number) for number in _ENDING}
-    handled = {number: handler for number, handler in handlers.items() if callable(handler)}
-    for number in handled:
-        signal.signal(number, lambda one, _: received.append(one))
-    try:
-        yield
-    finally:
-        for number, handler in handled.items():
-            signal.signal(number, handler)
-    if received:
-        signal.raise_signal(received[0])
 
 
 def _owner_is_gone(folder: Path) -> bool:
@@ -468,19 +443,23 @@ def _set_environment(values: Mapping[str, str | None]) -> None:
 
 @contextmanager
 def _ray() -> Iterator[Any]:
-    """Ray, made quiet, while it starts; what it has kept of the environment is read anew."""
+    """Ray, made quiet, while it starts; what it has kept of the environment is read anew.
+
+    Its Python part puts no handler in place of ours, which would end this process without a word while Ray starts.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ray's own deprecations; a user can do nothing about them.
         with ray_process.without_slow_imports():
             import ray
         from ray import _raylet
-        from ray._private import worker
+        from ray._private import utils, worker
 
         native: Any = _raylet
         worker.print_to_stdstream = _to_log
         native.Config.initialize("")
         native.AuthenticationTokenLoader.instance().reset_cache()
-        yield ray
+        with _changed_attributes(utils, {"set_sigterm_handler": lambda handler: None}):
+            yield ray
 
 
 def _to_log(data: dict[str, Any], ignore_prefix: bool = False) -> None:

@@ -9,7 +9,7 @@ from collector.objects.articulation import Mesh
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
 from collector.objects.partnet import META_FILE, SEMANTICS_FILE, URDF_FILE
 from shared.errors import UsageError
-from shared.io.files import remove_tree, temporary_name
+from shared.io.files import remove_tree, sync_folder, temporary_name, write_new_folder
 
 MESH_FOLDER = "textured_objs"
 GENERATOR = "adaafford"
@@ -134,16 +134,14 @@ def write_folder(folder: Path, files: Mapping[str, str]) -> Path:
     # Readers pass over hidden folders, so a kill leaves nothing that could be taken for an object.
     partial = folder.parent / temporary_name(folder.name)
     try:
-        for name in {str(Path(name).parent) for name in files}:
-            (partial / name).mkdir(parents=True, exist_ok=True)
-        for name, text in files.items():
-            (partial / name).write_text(text, encoding="utf-8", newline="\n")
+        write_new_folder(partial, {name: text.encode() for name, text in files.items()})
         try:
             partial.rename(folder)
         except OSError:
             # Another process may have written the same object meanwhile.
             if not holds(folder, files):
                 raise
+        sync_folder(folder.parent)
     finally:
         remove_tree(partial)
     return folder

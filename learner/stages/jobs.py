@@ -304,7 +304,11 @@ def read_policy_folder(folder: Path) -> Policy:
         StoreError: it is damaged.
     """
     if not (folder / POLICY_FILE).is_file():
-        raise UsageError(f"{folder}: holds no {POLICY_FILE}; name the --out of a finished stage, or a bundled policy")
+        # Of a run, or of an alternation.
+        stages = [*folder.glob(f"*/{POLICY_FILE}"), *folder.glob(f"*/*/{POLICY_FILE}")]
+        newest = max(stages, key=lambda path: path.stat().st_mtime, default=None)
+        known = "the --out of a finished stage" if newest is None else f"a stage in it, such as {newest.parent}"
+        raise UsageError(f"{folder}: holds no {POLICY_FILE}; name {known}, or a bundled policy")
     limits = {POLICY_FILE: MAX_POLICY_JSON_BYTES, WEIGHTS_FILE: MAX_WEIGHTS_BYTES}
     return Policy.from_files({name: read_bounded(folder / name, limit) for name, limit in limits.items()})
 

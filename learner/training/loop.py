@@ -27,7 +27,7 @@ from learner.training.trackers import Trackers
 from shared.errors import UsageError
 from shared.formatting import finite
 from shared.io.documents import json_lines
-from shared.io.files import read_bounded, remove_remnants
+from shared.io.files import read_bounded, remove_remnants, write_atomically
 from shared.progress import Progress, minutes
 from shared.seeds import generator
 
@@ -292,9 +292,7 @@ class _Loop:
             if isinstance(at := line.setdefault("step", 0), int | float) and at <= step
         ]
         text = "".join(json.dumps(line) + "\n" for line in kept)
-        temporary = path.with_suffix(".tmp")
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
+        write_atomically(path, text.encode())
 
 
 def rate_factor(config: TrainingConfig, step: int) -> float:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
-from pydantic_core import from_json
+from pydantic_core import ErrorDetails, from_json
 
 from shared.errors import StoreError
 from shared.io.files import read_bounded
@@ -21,6 +21,8 @@ MAX_VALUES = 1 << 20
 """Of a document: a hostile one has a value in every three bytes, and each takes a hundred bytes of memory and more."""
 MAX_PROBLEMS = 1000
 """A document with more is only said to have so many: their list alone could take gigabytes."""
+VALUE_ERROR = "Value error, "
+"""What pydantic puts before the message of a check."""
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -87,13 +89,18 @@ def json_lines(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
             yield found
 
 
+def reason_of(problem: ErrorDetails) -> str:
+    """What is wrong with a value, in the words of the check that refused it."""
+    return problem["msg"].removeprefix(VALUE_ERROR)
+
+
 def problem_of(error: ValidationError) -> str:
     """The first thing that is wrong with a document, in a line of bounded length."""
     if error.error_count() > MAX_PROBLEMS:
         return f"{error.error_count()} values are not allowed"
     problem = error.errors(include_url=False, include_context=False, include_input=False)[0]
     place = ".".join(map(str, problem["loc"])) or "content"
-    return f"{plain(place, MAX_WORD)}: {plain(problem['msg'], 100)}"
+    return f"{plain(place, MAX_WORD)}: {plain(reason_of(problem), 100)}"
 
 
 def named_twice(pairs: list[tuple[str, Any]]) -> str | None:

@@ -20,7 +20,7 @@ import socket
 import stat
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -60,6 +60,19 @@ def write_durably(path: Path, data: bytes) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_new_folder(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Make a folder with files, by relative path, and force all of it to the disk; not atomic, as `write_durably`."""
+    folder.mkdir(parents=True)
+    folders = {folder}
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, data)
+        folders |= {parent for parent in path.parents if parent.is_relative_to(folder)}
+    for parent in sorted(folders, reverse=True):
+        sync_folder(parent)
 
 
 def _write_all(descriptor: int, data: bytes) -> None:
@@ -134,6 +147,13 @@ def sync_folder(path: Path) -> None:
             raise
     finally:
         os.close(descriptor)
+
+
+def sync_tree(folder: Path) -> None:
+    """Force what others wrote into a folder to the disk, at every depth."""
+    for path in folder.rglob("*"):
+        (sync_folder if path.is_dir() else sync_file)(path)
+    sync_folder(folder)
 
 
 def write_atomically(path: Path, data: bytes) -> None:

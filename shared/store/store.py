@@ -486,6 +486,8 @@ def _refuse_foreign(backend: StorageBackend) -> None:
         # The other process may have finished since, and its first shard may be there.
         if not name.startswith((TEMPORARY_PREFIX, LOCK_PREFIX)) and not backend.exists(STORE_FILE):
             raise StoreError(f"{backend.where}: is not empty and no store (it holds {name!r}); name an empty folder")
+    if not backend.is_there() and backend.exists(""):
+        raise StoreError(f"{backend.where}: is a file, so no store can be made here; name a new folder")
 
 
 def _stored(columns: Sequence[str] | None) -> list[str] | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from adaafford import console
 from cluster.cli.main import COMMANDS, guarded, only_prints, run
 from shared.store import Store
 from shared.tasks import TEST_CATEGORIES
@@ -110,7 +111,7 @@ def test_a_signal_says_how_to_go_on(number: signal.Signals) -> None:
     script = (
         "import signal, sys; from cluster.cli import main\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
-        f"main.run = lambda args: main.guarded(lambda: signal.raise_signal({int(number)}), args)\n"
+        f"main._run = lambda args: signal.raise_signal({int(number)})\n"
         "sys.argv[1:] = ['collect', '--store', 'my store']\n"
         "main.main()"
     )
@@ -120,6 +121,19 @@ def test_a_signal_says_how_to_go_on(number: signal.Signals) -> None:
         "adaafford: interrupted; committed data stay, and the same command continues: "
         "adaafford collect --store 'my store'\n"
     )
+
+
+def test_an_interrupt_before_the_command_line_is_imported_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(console, "import_module", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        console.main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "adaafford: interrupted\n"
 
 
 @pytest.mark.parametrize("args", [["--rollouts", "x"], ["--rolouts", "3"], ["--rollouts", "0"]])
@@ -218,16 +232,34 @@ def test_an_interrupt_is_one_line_that_says_whether_the_same_command_continues(
     assert only_prints(args) is not continues
 
 
-@pytest.mark.parametrize(("moment", "code"), [("main._interrupted", 130), ("main.Streams.settle", -signal.SIGINT)])
-def test_a_second_interrupt_after_a_command_ended_prints_no_traceback(moment: str, code: int) -> None:
+@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_second_signal_does_not_disturb_the_report_of_the_first(
+    first: signal.Signals, second: signal.Signals
+) -> None:
     script = (
-        "import signal; from cluster.cli import main\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "def interrupt(*_): signal.raise_signal(signal.SIGINT)\n"
-        "main.run = lambda args: main.guarded(interrupt, ['run'])\n"
-        f"{moment} = interrupt\n"
+        "import signal, sys; from cluster.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
+        f"main._run = lambda args: signal.raise_signal({int(first)})\n"
+        f"main.plain = lambda text: [text, signal.raise_signal({int(second)})][0]\n"
+        "sys.argv[1:] = ['resume', 'RUN']\n"
         "main.main()"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == code
+    assert done.returncode == 128 + first
+    assert done.stderr == (
+        "adaafford: interrupted; committed data stay, and the same command continues: adaafford resume RUN\n"
+    )
+
+
+def test_a_second_interrupt_after_the_report_ends_the_process_without_a_traceback() -> None:
+    script = (
+        "import signal, sys; from cluster.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "def interrupt(*_): signal.raise_signal(signal.SIGINT)\n"
+        "main._run = main.Streams.settle = interrupt\n"
+        "main.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGINT
     assert "Traceback" not in done.stderr

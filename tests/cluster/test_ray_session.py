@@ -23,6 +23,7 @@ from cluster.cli.commands import bench
 from cluster.workers import ray_process, session
 from cluster.workers.session import ray_session
 from shared.errors import UsageError, WorkerError
+from shared.interrupts import undisturbed
 from shared.io import private
 
 ROOT = Path(__file__).parents[2]
@@ -405,13 +406,50 @@ def test_a_session_may_end_in_a_thread_where_no_signals_are_handled() -> None:
     done: list[bool] = []
 
     def end() -> None:
-        with session._undisturbed():
+        with undisturbed():
             done.append(True)
 
     thread = threading.Thread(target=end)
     thread.start()
     thread.join()
     assert done == [True]
+
+
+def test_sigterm_ends_a_session_that_starts_as_it_ends_any_command(
+    sessions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def starting(**settings: object) -> None:
+        from ray._private import utils
+
+        # As Ray does at the beginning of its own.
+        utils.set_sigterm_handler(lambda number, frame: sys.exit(number))
+        signal.raise_signal(signal.SIGTERM)
+
+    def end(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ray.init", starting)
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        with pytest.raises(KeyboardInterrupt), ray_session(1):
+            pass
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert list(sessions.iterdir()) == []
+
+
+def test_our_handler_of_sigterm_is_in_its_place_while_a_session_lives(
+    sessions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As Ray's native part does.
+    monkeypatch.setattr("ray.init", lambda **_: signal.signal(signal.SIGTERM, signal.SIG_IGN))
+    monkeypatch.setattr("ray.shutdown", lambda: None)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with ray_session(1):
+            assert signal.getsignal(signal.SIGTERM) is before
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_an_interrupt_while_a_session_starts_leaves_no_process(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.runs.run_log import BEAT_SHARE, RunLog, pause_s
+from tests.support.synced import Synced
 from tests.support.waiting import wait_until
 
 
@@ -144,3 +145,9 @@ def test_a_log_that_cannot_be_written_for_a_while_ends_nothing(
     run_log.run({"a": run}, lambda line: None)
     assert run_log.finished == ("a",)
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_new_log_survives_a_power_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced = Synced(monkeypatch)
+    RunLog(tmp_path / "log.jsonl").note("attempt")
+    assert synced.lacks(tmp_path) == [str(tmp_path.parent)]

@@ -24,6 +24,7 @@ from collector.objects.readers import read_object
 from collector.objects.writing import obj_text
 from shared.errors import ObjectError, UsageError
 from shared.extras import MODULES
+from tests.support.synced import Synced
 
 EXACT = ("package://package", "model://package", "../meshes")
 """Names that say where the mesh is; the others only say how its path ends."""
@@ -339,6 +340,14 @@ def test_the_command_shows_the_object_before_and_after(
     # What was not imported is never replaced.
     (out / "cabinet/meta.json").write_text('{"model_cat": "Box"}')
     assert run([*line, "--replace"]) == 2
+
+
+def test_an_object_that_was_imported_survives_a_power_cut(
+    cabinet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = Synced(monkeypatch)
+    assert run(["objects", "import", str(cabinet), "--out", str(tmp_path / "objects"), "--front", "+y"]) == 0
+    assert synced.lacks(tmp_path / "objects/cabinet") == []
 
 
 def test_an_import_that_was_stopped_before_its_picture_goes_on(

@@ -16,6 +16,7 @@ from collector.objects.readers import read_object
 from collector.objects.writing import object_files, write_object
 from shared.errors import UsageError
 from shared.tasks import TASKS
+from tests.support.synced import Synced
 
 EACH = 6
 IDS = [f"{category.lower()}-{index:04d}" for category in procedural.EVERY_CATEGORY for index in range(EACH)]
@@ -192,6 +193,12 @@ def test_the_same_command_again_changes_nothing(tmp_path: Path) -> None:
     assert state() == before
     procedural.generate(tmp_path, {"Box": 3}, seed=0)
     assert before.items() <= {**state(), tmp_path: 0}.items()
+
+
+def test_an_object_that_has_its_name_survives_a_power_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced = Synced(monkeypatch)
+    (folder,) = procedural.generate(tmp_path, {"Box": 1}, seed=0)
+    assert synced.lacks(folder) == []
 
 
 def test_another_object_is_never_overwritten(tmp_path: Path) -> None:

@@ -362,6 +362,18 @@ def test_a_training_starts_from_a_bundled_policy_by_name(
         assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("stage", ["aip-2", "training/aip-2"])
+def test_a_whole_run_as_a_start_is_answered_with_a_stage_of_it(
+    stage: str, store: Path, config_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run" / stage).mkdir(parents=True)
+    (tmp_path / "run" / stage / "policy.json").touch()
+    where = ["--store", str(store), "--out", str(tmp_path / "out"), "--config", str(config_file)]
+    assert run(["train", "aap", *where, "--init", str(tmp_path / "run")]) == 2
+    said = f"{tmp_path}/run: holds no policy.json; name a stage in it, such as {tmp_path}/run/{stage}, or a bundled"
+    assert said in capsys.readouterr().err
+
+
 def test_every_stage_learns_in_bf16(store: Path, tmp_path: Path) -> None:
     before: Path | None = None
     for stage in ("prior", "aap", "aip"):

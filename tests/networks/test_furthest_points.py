@@ -3,10 +3,12 @@
 import hashlib
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,8 @@ from hypothesis import strategies as st
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
+from shared import compilation
+from shared.compilation import compiled
 from shared.io import private
 from shared.policies import furthest_points as module
 from shared.policies.furthest_points import furthest_points
@@ -82,6 +86,21 @@ def test_compiled_code_is_kept_in_the_cache_of_the_user_and_nowhere_without_a_ho
     assert list(temporary.rglob("*.nbi"))
     assert list(here.iterdir()) == []
     shutil.rmtree(temporary)
+
+
+def test_an_interrupt_during_a_compilation_waits_for_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    class Interrupted:
+        def compile(self, signature: str) -> None:
+            signal.raise_signal(signal.SIGINT)
+            done.append(signature)
+
+    monkeypatch.setattr(compilation, "njit", lambda function, **_: Interrupted())
+    kept: Any = compiled()(abs)
+    with pytest.raises(KeyboardInterrupt):
+        kept.compile("int64(int64)")
+    assert done == ["int64(int64)"]
 
 
 def test_all_that_is_compiled_is_kept_there() -> None:

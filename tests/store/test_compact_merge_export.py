@@ -22,6 +22,7 @@ from shared.store.maintenance.formats import plain
 from shared.types import pack_normals
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting, identical
 from tests.support.faults import Fault, disk_faults
+from tests.support.killed_writers import kill_while_writing
 
 SETTING = fabricate_setting()
 PLAN = Plan(setting=SETTING)
@@ -118,6 +119,14 @@ def test_merging_is_a_union(tmp_path: Path, s3_url: str) -> None:
     assert verify(merged) == []
     assert merge([other, one], tmp_path / "reversed")[0].digest() == whole.digest()
     assert merge([one, other], tmp_path / "merged")[1] == done, "it can be repeated"
+
+
+def test_what_a_killed_merge_or_compaction_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    one, merged = make(tmp_path / "one", (0, 2)), make(tmp_path / "merged", (0, 2))
+    left = [kill_while_writing(store.shards_folder / "half") for store in (one, merged)]
+    merge([one], merged.where)
+    compact(one, 2)
+    assert not any(path.exists() for path in left)
 
 
 def test_stores_that_disagree_are_not_merged(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from shared.store.maintenance.steps import Content, survey
 from tests.support.fabricate import fabricate_rollout, fabricate_setting
 from tests.support.faults import Fault, disk_faults
 from tests.support.killed_writers import kill_while_writing
+from tests.support.synced import Synced
 
 SETTING = fabricate_setting(objects=3, points=64)
 PLANS = Plan(setting=SETTING), Plan(setting=SETTING, proposer="aip", policy_version=1)
@@ -316,6 +317,15 @@ def test_an_export_that_was_stopped_goes_on(name: str, store: Store, tmp_path: P
     assert not out.with_name("out.unfinished").exists()
     written = [done for done, total in said[before:] if total == said[before - 1][1]]
     assert len(written) < before - 5, "pieces that were finished are not written again"
+
+
+@pytest.mark.parametrize("name", EXPORT_FORMATS.names())
+def test_an_export_that_has_its_name_survives_a_power_cut(
+    name: str, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = Synced(monkeypatch)
+    export(store, tmp_path / "out", SPLITS, format=name)
+    assert synced.lacks(tmp_path / "out") == []
 
 
 def test_an_export_that_has_all_but_its_name_is_not_written_again(store: Store, tmp_path: Path) -> None:

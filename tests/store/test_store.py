@@ -316,6 +316,8 @@ def test_a_place_is_checked_as_a_store_is_made(tmp_path: Path) -> None:
         Store.check_free(tmp_path / "made", SETTING.model_copy(update={"seed": SETTING.seed + 1}))
     with pytest.raises(StoreError, match="is not empty and no store"):
         Store.check_free(tmp_path, None)
+    with pytest.raises(StoreError, match="is a file, so no store can be made here; name a new folder"):
+        Store.check_free(tmp_path / "made" / "store.json", None)
 
 
 def test_folders_that_are_no_store_are_refused(tmp_path: Path) -> None:

@@ -145,7 +145,14 @@ def _store_page(command: ViewCommand) -> "Callable[[viser.ViserServer], object]"
     if command.objects is not None and not command.objects.is_dir():
         raise UsageError(f"--objects {command.objects}: there is no such folder; name that of the store's objects")
     published = known.policy_versions()
-    given = {plain(name): partial(lambda policy: policy, load_policy(name)) for name in dict.fromkeys(command.policy)}
+    loaded = {name: load_policy(name) for name in dict.fromkeys(command.policy)}
+    for name, policy in loaded.items():
+        if policy.task != known.setting.task:
+            raise UsageError(
+                f"--policy {name}: is for '{policy.task}', but the store is of '{known.setting.task}'; "
+                "name one of this task"
+            )
+    given = {plain(name): partial(lambda policy: policy, policy) for name, policy in loaded.items()}
     policies = given | {f"version {each}": partial(_published, known, each) for each in published}
     newest = [f"version {each}" for each in published[-1:]]
     from cluster.viewing.store_page import StorePage

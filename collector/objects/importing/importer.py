@@ -19,7 +19,7 @@ from collector.objects.urdf_bodies import listed
 from collector.objects.writing import holds, object_files, write_folder
 from shared.errors import ObjectError, StoreError, UsageError
 from shared.extras import require_packages
-from shared.io.files import read_bounded, remove_remnants, remove_tree, temporary_name, writing
+from shared.io.files import read_bounded, remove_remnants, remove_tree, sync_folder, temporary_name, writing
 from shared.io.text import plain, short
 
 MAX_META_BYTES = 1 << 20
@@ -157,6 +157,7 @@ def _write(folder: Path, model: ObjectModel, source: Source, *, replace: bool) -
                     raise _taken(folder)
                 folder.rename(scratch / "replaced")
             written.rename(folder)
+            sync_folder(folder.parent)
         finally:
             remove_tree(scratch)
     return judged

@@ -20,6 +20,7 @@ from shared.io.files import (
     unreadable,
     write_atomically,
     write_durably,
+    write_new_folder,
 )
 from shared.store.backends.base import StorageBackend, Transaction
 from shared.store.layout import LOCK_PREFIX
@@ -178,14 +179,6 @@ def _mode(path: Path, *, follow: bool = True) -> int:
 
 
 def _write_files(folder: Path, files: Mapping[str, bytes], mark: str, description: bytes) -> None:
-    folder.mkdir()
-    folders = {folder}
-    for name, data in files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(path, data)
-        folders |= {parent for parent in path.parents if parent.is_relative_to(folder)}
-    for parent in sorted(folders, reverse=True):
-        sync_folder(parent)
+    write_new_folder(folder, files)
     write_durably(folder / mark, description)
     sync_folder(folder)

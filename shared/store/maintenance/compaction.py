@@ -47,6 +47,7 @@ def compact(store: Store, most: int, progress: Callable[[int, int], None] | None
     if not 2 <= most <= MAX_ROWS:
         raise UsageError(f"--rollouts {most} is not allowed; choose 2 to {MAX_ROWS}")
     with alone(store.backend):
+        store.sweep()
         jobs = store.jobs()
         counting = _counting(jobs)
         # What an earlier compaction was killed before it could set aside.

@@ -24,6 +24,7 @@ from shared.io.files import (
     scratch_folder,
     sync_file,
     sync_folder,
+    sync_tree,
     write_atomically,
 )
 from shared.store.backends.base import backend_of, is_url
@@ -156,6 +157,7 @@ class DiskDestination(Destination):
         return files
 
     def complete(self) -> None:
+        sync_tree(self.folder)
         # It names this machine. The other notes stay until the folder has its name: a kill here loses nothing.
         (self._notes / DRIVER_LOCK).unlink()
         self.folder.rename(self._out)

@@ -58,6 +58,7 @@ def merge(
     store = Store.create(out, sources[0].setting, sources[0].document.more)
     holders = {each.job: each.source for each in reversed(held)}
     with alone(store.backend):
+        store.sweep()
         for plan in plans.values():
             store.add_plan(plan)
         for source in sources:
