@@ -136,7 +136,7 @@ class Timing(StrictModel):
 PUBLISHED_TIMING = Timing(steps_per_second=500, leg_steps=2000, hold_steps=2000)
 
 
-FidelityVersion = Literal[1, 2, 3]
+FidelityVersion = Literal[1, 2, 3, 4]
 """What of a trial `fast` leaves out (docs/physics.md)."""
 
 
@@ -160,9 +160,9 @@ class Fidelity(StrictModel):
     jointed_hand: bool = False
     """Attach the hand to six joints, as published, instead of a free body with the same drives."""
     version: FidelityVersion = Field(1, exclude_if=lambda version: version == 1)
-    """2: what nothing can change is not waited for; 3: nor are fingers that slide along what does not move
-    (docs/physics.md). A document that describes its fidelity without a version is of 1, as collections were before
-    there was another."""
+    """2: what nothing can change is not waited for; 3: nor are fingers that slide along what does not move; 4: a hand
+    does not fly into the object (docs/physics.md). A document that describes its fidelity without a version is of 1, as
+    collections were before there was another."""
 
 
 FIDELITIES = {

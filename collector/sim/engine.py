@@ -22,7 +22,19 @@ Link: TypeAlias = physx.PhysxArticulationLinkComponent
 DENSITY = 1000.0
 """SAPIEN's default; only the shape of a link's inertia matters, since its mass is drawn."""
 
-__all__ = ["DENSITY", "Assembly", "Link", "convex_shapes", "cooked", "new_scene", "physx", "pose", "sapien", "set_mass"]
+__all__ = [
+    "DENSITY",
+    "Assembly",
+    "Link",
+    "convex_shapes",
+    "cooked",
+    "half_spaces",
+    "new_scene",
+    "physx",
+    "pose",
+    "sapien",
+    "set_mass",
+]
 
 
 def new_scene(solver_iterations: int) -> tuple[sapien.Scene, physx.PhysxCpuSystem]:
@@ -138,6 +150,15 @@ def convex_shapes(link: Link) -> tuple[Mesh, ...]:
         Mesh(np.asarray(shape.vertices, dtype=np.float64), np.zeros((0, 3), dtype=np.int32))
         for shape in link.collision_shapes
     )
+
+
+def half_spaces(shape: physx.PhysxCollisionShapeConvexMesh) -> tuple[Float, Float]:
+    """A convex piece as n . x <= d: normals [F, 3] and distances [F], frame of its link."""
+    corners = np.asarray(shape.vertices, dtype=np.float64)[np.asarray(shape.triangles)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    normals, corners = normals[lengths > 0] / lengths[lengths > 0, None], corners[lengths > 0]
+    return normals, (normals * corners[:, 0]).sum(axis=1)
 
 
 def set_mass(link: Link, mass: float) -> None:

@@ -6,11 +6,13 @@ it. At rest, the positions of the joints are the whole state of the object.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from collector.objects.articulation import ArticulatedObject, Joint
 from collector.sim.engine import Assembly, Link, new_scene, physx, pose, sapien, set_mass
+from collector.sim.flight import FreeSpace
 from collector.sim.grippers import GRIPPERS
 from collector.sim.mechanisms import FRICTION_DAMPING, Holds
 from collector.sim.shortcuts import CONTACT_RANGE, SHORTCUTS
@@ -39,7 +41,8 @@ class Contact:
         finger_on: bodies (0 the root, k the k-th part) that a finger presses on.
         palm: whether the palm presses on anything.
         brushes: whether the hand touches anything, with any force.
-        clearance: a lower bound of the distance between hand and object, within the engine's range.
+        clearance: the least distance between hand and object that the engine lists, within its range. They are not
+            nearer to each other if they touch; while they are apart, they may be.
     """
 
     finger_on: frozenset[int]
@@ -99,6 +102,11 @@ class Scene:
         self._impulse_squared = 0.0
         self.limits = target.limits()
         self.park()
+
+    @cached_property
+    def free_space(self) -> FreeSpace:
+        """Around the object, for the hand to fly in."""
+        return FreeSpace([self.gripper.palm, *self.gripper.fingers], self._links)
 
     @property
     def links(self) -> list[Link]:

@@ -39,6 +39,8 @@ class Shortcuts:
         decisive: at a standstill in the last leg.
         sliding: in the drag of closed fingers, the hand moves up to so many times faster while no joint has moved in
             it.
+        measures_flight: free flight ends where the shapes of hand and object could touch, not where the engine lists
+            that they are near.
     """
 
     first_step: Timing | None = None
@@ -48,6 +50,7 @@ class Shortcuts:
     preparing: Strides = Strides()
     decisive: Strides = Strides()
     sliding: int = 1
+    measures_flight: bool = False
 
 
 _SECOND = Shortcuts(
@@ -63,5 +66,6 @@ _SECOND = Shortcuts(
     preparing=Strides(16, 0.4),
     decisive=Strides(4, 0.2),
 )
-SHORTCUTS = {1: Shortcuts(), 2: _SECOND, 3: replace(_SECOND, sliding=8)}
+_THIRD = replace(_SECOND, sliding=8)
+SHORTCUTS = {1: Shortcuts(), 2: _SECOND, 3: _THIRD, 4: replace(_THIRD, measures_flight=True)}
 """By `Fidelity.version`."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from collector.objects.articulation import Mesh
-from collector.sim.engine import Assembly, Link, physx, pose, sapien
+from collector.sim.engine import Assembly, Link, half_spaces, physx, pose, sapien
 from collector.sim.gripper import TIP_DISTANCE, Gripper, build_free, convex, frame, make_weightless
 from collector.sim.jointed_gripper import build_jointed
 from shared.types import Float
@@ -148,7 +148,7 @@ class SuctionGripper:
     def _sealed_link(self, world_from_lip: Float) -> Link | None:
         """The link that the cup seals on, where it seals on one."""
         if self._pieces is None:
-            self._pieces = [(link, [_half_spaces(shape) for shape in link.collision_shapes]) for link in self._links]
+            self._pieces = [(link, [half_spaces(shape) for shape in link.collision_shapes]) for link in self._links]
         angles = np.linspace(0, 2 * np.pi, RIM_POINTS, endpoint=False)
         rim = np.stack([RADIUS * np.cos(angles), RADIUS * np.sin(angles), np.zeros(RIM_POINTS)], axis=1)
         depths = np.full((len(self._pieces), RIM_POINTS), np.inf)
@@ -169,15 +169,6 @@ class SuctionGripper:
         apart = np.abs(nearest - nearest.mean() - rim[:, :2] @ slope).max()
         flat = apart <= FLATNESS and np.arctan(np.linalg.norm(slope)) <= MOST_TILT_RAD
         return self._pieces[int(first[0])][0] if flat else None
-
-
-def _half_spaces(shape: physx.PhysxCollisionShapeConvexMesh) -> tuple[Float, Float]:
-    """A convex piece as n . x <= d: normals [F, 3] and distances [F], frame of its link."""
-    corners = np.asarray(shape.vertices, dtype=np.float64)[np.asarray(shape.triangles)]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    normals, corners = normals[lengths > 0] / lengths[lengths > 0, None], corners[lengths > 0]
-    return normals, (normals * corners[:, 0]).sum(axis=1)
 
 
 def _depths(origins: Float, direction: Float, normals: Float, distances: Float) -> Float:

@@ -4,10 +4,11 @@ import math
 
 import numpy as np
 
-from collector.sim.gripper import GRASP_OPENING, still
+from collector.sim.gripper import GRASP_OPENING, frame, still
 from collector.sim.scene import Scene
 from collector.sim.shortcuts import REST_MOTION, REST_STEPS, SHORTCUTS
 from shared.config import Fidelity
+from shared.geometry import rotation_about_z
 from shared.primitives import START_DISTANCE, Leg, PrimitiveSpec, hand_start
 from shared.types import Action, Float, Outcome, OutcomeKind
 
@@ -67,6 +68,7 @@ class Trial:
         self._brushed = False
         self._timing = fidelity.approach
         self._clearance = 0.0
+        self._flew = False
         self._closed = False
         self._grasps = False
         self._attached = False
@@ -138,6 +140,7 @@ class Trial:
         # A hand that turns may come nearer than its way tells.
         flies = self.fidelity.skip_free_flight and stride > 0 and path[0, 3] == path[-1, 3]
         gripper.drive_velocity(velocity)
+        self._flew = False
         step, ahead = 0, 1
         while step < steps:
             self._set_pace(ahead if self._slides else 1, velocity)
@@ -189,9 +192,35 @@ class Trial:
         room = self._clearance - CLEARANCE
         if room / stride < LEAST_SKIP:
             return 0
-        lag = path[step, :3] - self.scene.gripper.displacement()
-        ahead = min(int((room - math.sqrt(lag @ lag)) / stride), len(path) - 1 - step)
+        most = len(path) - 1 - step
+        if self._shortcuts.measures_flight:
+            ahead = self._measured_flight(path[step], path[step + 1, :3] - path[step, :3], most) if most else 0
+        else:
+            ahead = min(int((room - self._lag(path[step])) / stride), most)
         return ahead if ahead >= LEAST_SKIP else 0
+
+    def _measured_flight(self, place: Float, stride: Float, most: int) -> int:
+        """How many steps of a leg the hand can fly from `place`, [4]; 0 where that has been asked and is still so.
+
+        Args:
+            place: where it should be now.
+            stride: [3], what it moves in a step, both counted from where it was placed.
+            most: steps that are left.
+        """
+        if not self._checked:
+            # Before the first touch nothing moves, so that a second flight would end where the first one did.
+            if self._flew or self._brushed:
+                return 0
+            self._flew = True
+        turn = rotation_about_z(place[3])
+        origin = hand_start(self.action) + self.action.rotation @ place[:3]
+        world_from_hand = frame(self.action.rotation @ turn, origin)
+        return self.scene.free_space.steps(world_from_hand, turn.T @ stride, most, CLEARANCE + self._lag(place))
+
+    def _lag(self, place: Float) -> float:
+        """How far the hand is from `place`, [4], m."""
+        lag = place[:3] - self.scene.gripper.displacement()
+        return math.sqrt(lag @ lag)
 
     def _ahead(self, stride: float, ahead: int) -> int:
         """How many steps of its leg the target moves at the next step of the engine.

@@ -13,6 +13,7 @@ import pytest
 
 from benchmarks.published import PublishedSettings, measure
 from benchmarks.script import run_script
+from cluster.cli.benchmarks import fidelity
 from cluster.cli.benchmarks.dynamics import ALL, DynamicsTrial, by_category
 from cluster.cli.benchmarks.fidelity import PairedTrial, compare, summarise
 from cluster.cli.commands.bench import keep
@@ -100,6 +101,22 @@ def test_what_moves_nothing_is_executed_in_the_reference_in_part_and_counts_for_
     assert share[0].positive_f1_low == share[0].positive_f1_high == 1.0
 
 
+def test_the_reference_is_executed_again_with_the_hand_beside(objects: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refs = tuple(entry.ref for entry in scan(objects).usable)
+    camera = CameraConfig(image_size=128, points=256, candidates=1000)
+    plan = Plan(setting=Setting(task="push", seed=3, objects=refs, collection=CollectionConfig(camera=camera)))
+    alone = compare(plan, objects, COARSE, [COARSE], 12, lambda: None)
+    judged, itself = compare(plan, objects, COARSE, [COARSE], 12, lambda: None, again=True)
+    assert replace(judged, reference_ms=0, candidate_ms=0) == replace(alone[0], reference_ms=0, candidate_ms=0)
+    assert (itself.trials, itself.positives) == (judged.trials, judged.positives)
+    assert itself.positive_f1 > 0.9
+    assert 0 < itself.motion_error_median < 1e-3
+    # As far as a hand that starts at another place: other trials.
+    monkeypatch.setattr(fidelity, "DISPLACED", 0.5)
+    elsewhere = compare(plan, objects, COARSE, [COARSE], 12, lambda: None, again=True)[-1]
+    assert elsewhere.label_agreement < 1.0
+
+
 def test_a_trial_counts_as_often_as_its_weight_says() -> None:
     pairs = [pair(True, True, (0.5, 0.5)), pair(True, False, (0.02, 0.0)), replace(pair(False, False), weight=8.0)]
     result = summarise(pairs)
@@ -134,12 +151,15 @@ def test_fidelity_prints_its_figures(capsys: pytest.CaptureFixture[str], objects
     expected += " positive_f1_low positive_f1_high stands_for candidate_steps drawn quiet_share"
     assert set(expected.split()) <= found.keys()
     assert found["trials"] == 3
-    flags = ["--trials", "3", "--versions", "1", "3", "--quiet-share", "0.5"]
+    assert "again" not in found
+    flags = ["--trials", "3", "--versions", "1", "3", "--quiet-share", "0.5", "--again"]
     found = bench(capsys, "fidelity", "--objects", str(objects), *flags, *COARSE_FLAGS)
     by_version = found["by_version"]
     assert isinstance(by_version, dict)
     assert list(by_version) == ["1", "3"]
     assert by_version["3"].items() <= found.items()
+    assert isinstance(found["again"], dict)
+    assert found["again"]["trials"] == found["trials"]
 
 
 def test_dynamics_prints_its_figures(capsys: pytest.CaptureFixture[str], objects: Path) -> None:

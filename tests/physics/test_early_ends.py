@@ -1,4 +1,4 @@
-"""What fidelity versions 2 and 3 do not wait for changes no outcome."""
+"""What fidelity versions 2 to 4 do not wait for changes no outcome."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ from shared.primitives import PRIMITIVES
 from shared.types import Action, Float, HiddenDynamics, Outcome, OutcomeKind
 from tests.support.single_door import door, drawer
 
-FULL, STILL, SLIDING = (Fidelity(version=version) for version in (1, 2, 3))
+FULL, STILL, SLIDING, MEASURING = (Fidelity(version=version) for version in (1, 2, 3, 4))
 EASY = {"part_mass": 0.2, "joint_friction": 0.05, "surface_friction": 1.0}
 FREE_EDGE, HINGE_EDGE, MIDDLE = (-0.32, -0.295, 0.0), (-0.32, 0.295, 0.0), (-0.32, 0.0, 0.0)
 INTO: Float = np.array([1.0, 0.0, 0.0])
@@ -35,7 +35,7 @@ def act(
     return Trial(scene, action, 1, spec, fidelity).run()
 
 
-@pytest.mark.parametrize("fidelity", [STILL, SLIDING], ids=["version 2", "version 3"])
+@pytest.mark.parametrize("fidelity", [STILL, SLIDING, MEASURING], ids=["version 2", "version 3", "version 4"])
 @pytest.mark.parametrize(
     ("make", "point", "primitive", "changed"),
     [

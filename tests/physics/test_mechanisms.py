@@ -172,7 +172,9 @@ def test_a_pressed_handle_opens_its_door_in_a_trial(fidelity: Fidelity) -> None:
 
 
 @pytest.mark.parametrize(
-    "fidelity", [Fidelity(), Fidelity(version=2), FAST, AS_PUBLISHED], ids=["1", "2", "3", "reference"]
+    "fidelity",
+    [Fidelity(), Fidelity(version=2), FAST, Fidelity(version=4), AS_PUBLISHED],
+    ids=["1", "2", "3", "4", "reference"],
 )
 def test_a_hand_that_stands_still_before_a_catch_presses_as_hard_as_it_can(fidelity: Fidelity) -> None:
     """The force grows while nothing moves, to 13.9 N at every fidelity."""

@@ -3,7 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,8 @@ NEAR_THRESHOLD = 0.008, 0.015
 """rad or length: a motion in the reference about the threshold of success, which the least difference decides."""
 MOVED = 0.002
 """rad or length: a trial in which a candidate moves the joint by more is always executed in the reference, too."""
+DISPLACED = 1e-5
+"""m: by how much the hand is placed beside where it was, to see how far the reference agrees with itself."""
 EMPTY_TURNS = 4
 """Turns over all objects without a single trial, after which there is nothing to be measured."""
 
@@ -142,6 +144,7 @@ def compare(
     trials: int,
     advance: Advance,
     quiet_share: float = 1.0,
+    again: bool = False,
 ) -> list[FidelityResult]:
     """Execute random trials, drawn as the collector draws them, in the reference and in each candidate.
 
@@ -154,14 +157,15 @@ def compare(
         advance: called after each.
         quiet_share: of the trials in which every candidate has the same kind and none moves the joint by more than
             `MOVED`, the share that is executed in the reference; each then counts for 1 / `quiet_share` trials.
+        again: whether to execute the trials of the reference again in it, with the hand `DISPLACED`.
 
     Returns:
-        The figures of each candidate.
+        The figures of each candidate and, with `again`, last those of the reference against itself.
 
     Raises:
         UsageError: no object shows anything that the task could act on.
     """
-    pairs: list[list[PairedTrial]] = [[] for _ in candidates]
+    pairs: list[list[PairedTrial]] = [[] for _ in range(len(candidates) + again)]
     done = index = 0
     while done < trials:
         if not done and index >= EMPTY_TURNS * len(plan.setting.objects):
@@ -170,9 +174,15 @@ def compare(
         every = range(min(len(rollout.trials), trials - done))
         judged = [execute(plan, fidelity, rollout, every) for fidelity in candidates]
         sound = min(len(outcomes) for outcomes in judged)
-        weights = _weights(judged, sound, quiet_share, seeds.generator(plan.setting.seed, "bench/fidelity", index))
-        for k, truth in execute(plan, reference, rollout, sorted(weights)).items():
+        rng = seeds.generator(plan.setting.seed, "bench/fidelity", index)
+        weights = _weights(judged, sound, quiet_share, rng)
+        truths = execute(plan, reference, rollout, sorted(weights))
+        if again:
+            judged.append(execute(plan, reference, _displaced(rollout, rng), sorted(weights)))
+        for k, truth in truths.items():
             for listed, outcomes in zip(pairs, judged, strict=True):
+                if k not in outcomes:
+                    continue
                 pair = PairedTrial(
                     rollout.target.ref.id, truth[0], outcomes[k][0], truth[1], outcomes[k][1], weights[k]
                 )
@@ -226,6 +236,16 @@ def execute(plan: Plan, fidelity: Fidelity, rollout: DrawnRollout, which: Sequen
         if outcome.kind is OutcomeKind.UNSTABLE:
             break
     return outcomes
+
+
+def _displaced(rollout: DrawnRollout, rng: np.random.Generator) -> DrawnRollout:
+    """The same trials, with the hand placed beside where it was, in a random direction."""
+    trials = []
+    for drawn in rollout.trials:
+        direction = rng.normal(size=3)
+        point = drawn.action.point + DISPLACED * direction / np.linalg.norm(direction)
+        trials.append(replace(drawn, action=replace(drawn.action, point=point)))
+    return replace(rollout, trials=tuple(trials))
 
 
 def _weights(

@@ -79,6 +79,9 @@ class FidelitySettings(BenchSettings):
     quiet_share: float = Field(1.0, gt=0, le=1)
     """Of the trials in which no candidate moves anything, the share that is also executed in the reference, which takes
     most of the time; each then counts for several."""
+    again: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Also execute the trials of the reference again in it, with the hand 1e-5 m beside where it was, and print how far
+    the reference agrees with itself."""
 
 
 class DynamicsSettings(BenchSettings):
@@ -167,11 +170,17 @@ def _fidelity(command: FidelitySettings) -> dict[str, Any]:
     candidates = [command.candidate.model_copy(update={"version": version}) for version in versions]
     with planned(command) as (plan, folder), Progress(f"trials, {command.task}", command.trials) as progress:
         reference, share = command.reference, command.quiet_share
-        results = compare(plan, folder, reference, candidates, command.trials, progress.advance, share)
+        results = compare(plan, folder, reference, candidates, command.trials, progress.advance, share, command.again)
+    itself = results.pop() if command.again else None
     for candidate, found in zip(candidates, results, strict=True):
         print_fidelity(found, reference, candidate)
+    if itself is not None:
+        print("again, with the hand placed 1e-5 m beside:")
+        print_fidelity(itself, reference, reference)
     result = results[-1].as_json() | {"drawn": command.trials, "quiet_share": share}
     result |= {"reference": reference.model_dump(), "candidate": candidates[-1].model_dump()}
+    if itself is not None:
+        result["again"] = itself.as_json()
     if command.versions:
         result["by_version"] = {str(v): found.as_json() for v, found in zip(versions, results, strict=True)}
     return result
