@@ -263,7 +263,7 @@ class Session:
         used: list[_Seen] = []
 
         def observe(cloud: str, wanted: str | None, followed: FollowedPart | None) -> Observation:
-            used.append(self._observe(cloud, wanted, history, followed))
+            used.append(self._observe(cloud, wanted, history, followed, used[-1].cut if used else None))
             return used[-1].observation
 
         known = history.interactions_with(lambda each: observe(each.cloud, each.cloud_sha256, each.part))
@@ -426,8 +426,10 @@ class Session:
         except ValueError as error:
             raise UsageError(f"{plain(name)}: {error}; rename the scan") from None
 
-    def _observe(self, name: str, wanted: str | None, history: History, followed: FollowedPart | None) -> "_Seen":
-        """What is seen in a cloud's file.
+    def _observe(
+        self, name: str, wanted: str | None, history: History, followed: FollowedPart | None, before: CutOut | None
+    ) -> "_Seen":
+        """What is seen in a cloud's file, after what was seen `before`.
 
         It is made once for the same content, since the networks' work on it is remembered with it.
         """
@@ -438,7 +440,7 @@ class Session:
         if (sha256, frame, followed) not in self._seen:
             scan, cut = self._parsed(data, path, history.part, history.lens), None
             if history.part is not None:
-                cut = self._finder.cut_out(scan, frame.up, frame.camera, history.part, followed, str(path))
+                cut = self._finder.cut_out(scan, frame.up, frame.camera, history.part, followed, str(path), before)
             self._remember(scan, cut, path, sha256, frame, followed)
         return self._seen[sha256, frame, followed]
 

@@ -114,6 +114,37 @@ def test_the_part_is_followed_where_it_moved_to(tmp_path: Path) -> None:
     assert [each.part is not None for each in history.interactions] == [True, True]
 
 
+class ForgetfulSegmenter(GivenSegmenter):
+    """Does not find the right door where a lamp is seen, which is above z = 2."""
+
+    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+        found = super().segment(points, camera, seed)
+        return found if points[:, 2].max() < 2.0 else Segmentation(found.object, found.parts[:1])
+
+
+def test_a_part_that_is_not_found_again_and_did_not_move_is_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parts, "bundled_segmenter", ForgetfulSegmenter)
+    lamp = [[1.2, 0.0, 2.5]]
+    first, *later = (
+        write(tmp_path / f"scan-{number}.npz", np.concatenate([room() + 0.002 * number, *([lamp] if number else [])]))
+        for number in range(3)
+    )
+    session(tmp_path, "2").step(first)
+    for tries, scan in enumerate(later, start=1):
+        step = session(tmp_path, None).step(scan, TOLD, tries)
+        assert step.tries == tries and step.part is not None
+        assert step.part.chosen.centre[1] < 0 and step.point[1] < 0
+        assert (step.part.chosen.number, step.part.chosen.confidence, step.part.chosen.points) == (2, 0.7, 1500)
+        assert [part.number for part in step.part.alternatives] == [1]
+    moved = write(tmp_path / "scan-3.npz", np.concatenate([room(right=0.7), lamp]))
+    with pytest.raises(PartError, match="is not found again"):
+        session(tmp_path, None).step(moved, TOLD, 3)
+    history = read_history(tmp_path / "history.json")
+    assert len(history.tried) == 2, "what is refused leaves the history as it was"
+
+
 def test_another_part_may_be_chosen_until_something_was_tried(tmp_path: Path) -> None:
     scan = write(tmp_path / "scan-1.npz", room())
     session(tmp_path, "auto").step(scan)
