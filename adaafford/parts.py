@@ -1,5 +1,6 @@
 """The movable part of a raw scan: found, chosen by confidence, by number or by a click, and followed from then on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -34,6 +35,8 @@ FOLLOW_M = 0.4
 """How far the middle of a part may move from one scan to the next."""
 STILL_M, STILL_SHARE = 0.02, 0.8
 """A part did not move where this share of its points has a point of the next scan so near."""
+UNMOVED_M = 0.05
+"""How far around a point that was gripped, and that did not move, nothing is marked."""
 PICTURE_POINTS = 60_000
 """Of a raw scan, in the picture of its parts."""
 PARTS_SUFFIX = "-parts"
@@ -174,6 +177,7 @@ class PartFinder:
         followed: FollowedPart | None,
         source: str,
         before: CutOut | None = None,
+        unmoved: Sequence[Vector] = (),
     ) -> CutOut:
         """Cut the object out of a scan and mark one of its parts.
 
@@ -185,6 +189,8 @@ class PartFinder:
             followed: the parts of the scan before; the choice then counts no more.
             source: the scan's name in messages.
             before: an earlier scan; a part that the network does not find again, and that did not move, is as there.
+            unmoved: points that were pulled in vain, frame of the scan; around them the part is not marked, unless that
+                is all of it.
 
         Raises:
             PartError: no such part is found.
@@ -219,11 +225,15 @@ class PartFinder:
         rows = of_object[_on_surfaces(scan.points[of_object])]
         if not (shades[rows] == _CHOSEN).any():
             rows = of_object
+        movable = shades[rows] == _CHOSEN
+        if unmoved:
+            free = cKDTree(np.array(unmoved)).query(scan.points[rows])[0] > UNMOVED_M
+            movable = movable & free if (movable & free).any() else movable
         cut = replace(
             scan,
             points=scan.points[rows],
             normals=None if scan.normals is None else scan.normals[rows],
-            movable=shades[rows] == _CHOSEN,
+            movable=movable,
             rows=rows if scan.rows is None else scan.rows[rows],
         )
         others = tuple(part for number, part in enumerate(numbered) if number != chosen)

@@ -2,15 +2,17 @@
 
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from adaafford import parts
 from adaafford.histories import TriedOutcome, read_history
-from adaafford.parts import PartChoice, PartError, PartFinder, read_segmenter
-from adaafford.scans import Scan, checked_scan
+from adaafford.parts import UNMOVED_M, CutOut, PartChoice, PartError, PartFinder, read_segmenter
+from adaafford.scans import Scan, Vector, checked_scan
 from adaafford.sessions import Session, SessionFiles, parts_file
 from cluster.cli.main import run as adaafford
 from shared.errors import StoreError, UsageError
@@ -24,7 +26,7 @@ from shared.segmentation.segmenter import (
     begun,
     part_labels,
 )
-from shared.types import Float
+from shared.types import Float, OutcomeKind
 from tests.support.small_networks import TINY
 
 UP, CAMERA = (0.0, 0.0, 1.0), (0.0, 0.0, 1.0)
@@ -67,9 +69,9 @@ def write(path: Path, points: Float) -> Path:
     return path
 
 
-def session(folder: Path, part: str | None = "auto") -> Session:
+def session(folder: Path, part: str | None = "auto", task: str = "pull-closed-door") -> Session:
     files = SessionFiles(folder / "history.json", folder / "heatmap.npz")
-    policy = Policy.untrained("pull-closed-door", TINY, 0)
+    policy = Policy.untrained(task, TINY, 0)
     for name in CORE:
         policy.with_trained(name)
     return Session(policy, files, part=part, points=256)
@@ -143,6 +145,45 @@ def test_a_part_that_is_not_found_again_and_did_not_move_is_where_it_was(
         session(tmp_path, None).step(moved, TOLD, 3)
     history = read_history(tmp_path / "history.json")
     assert len(history.tried) == 2, "what is refused leaves the history as it was"
+
+
+def test_around_points_that_were_pulled_in_vain_nothing_is_marked() -> None:
+    scan, finder = Scan(room()), PartFinder("pull-closed-door")
+
+    def marked(*unmoved: Vector) -> Float:
+        cut = finder.cut_out(scan, UP, CAMERA, "auto", None, "scan", unmoved=unmoved).scan
+        assert cut.movable is not None
+        return cut.points[cut.movable]
+
+    whole, x, y, z = marked(), 0.91, 0.15, 0.4
+    away = np.linalg.norm(whole - [x, y, z], axis=1)
+    assert np.array_equal(marked((x, y, z)), whole[away > UNMOVED_M])
+    everywhere = [(x, float(y), float(z)) for y in np.arange(0.02, 0.3, 0.04) for z in np.arange(0.1, 0.74, 0.04)]
+    assert np.array_equal(marked(*everywhere), whole), "something has to be left"
+
+
+@pytest.mark.parametrize(("policy", "kind", "elsewhere"), [
+    ("pull-closed-door", OutcomeKind.OK, True),
+    ("pull-closed-door", OutcomeKind.NO_CONTACT, False),
+    ("push", OutcomeKind.OK, False),
+])  # fmt: skip
+def test_a_pull_that_moves_nothing_is_not_made_again_there(
+    policy: str, kind: OutcomeKind, elsewhere: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = list[Sequence[Vector]]()
+    cut_out = PartFinder.cut_out
+
+    def spied(finder: PartFinder, *args: Any) -> CutOut:
+        told.append(args[-1])
+        return cut_out(finder, *args)
+
+    first = session(tmp_path, task=policy).step(write(tmp_path / "scan-1.npz", room()))
+    monkeypatch.setattr(PartFinder, "cut_out", spied)
+    again = session(tmp_path, task=policy).step(
+        write(tmp_path / "scan-2.npz", room() + 0.001), TriedOutcome(motion=0.0, kind=kind), 1
+    )
+    assert told == [(), (first.point,) if elsewhere else ()]
+    assert not elsewhere or np.linalg.norm(np.subtract(again.point, first.point)) > UNMOVED_M
 
 
 def test_another_part_may_be_chosen_until_something_was_tried(tmp_path: Path) -> None:
