@@ -39,6 +39,8 @@ MAX_NAME = 1000
 """Characters of a scan's path."""
 SUCCESS_MOTION = 0.01
 """Motion that counts as a success unless it is said otherwise: tau, rad or m, as published."""
+STILL_MOTION = 0.003
+"""Motion up to which nothing moved, rad or m."""
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -81,6 +83,11 @@ class TriedOutcome(StrictModel):
         success = moved if self.success is None else self.success
         width = math.nan if self.grasp_width is None else self.grasp_width
         return Outcome(self.kind, self.motion, success, grasp_opening=width)
+
+    @property
+    def held_still(self) -> bool:
+        """Whether something was gripped, and did not move."""
+        return self.kind is OutcomeKind.OK and self.motion <= STILL_MOTION
 
 
 class TriedInteraction(StrictModel):

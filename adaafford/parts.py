@@ -1,5 +1,6 @@
 """The movable part of a raw scan: found, chosen by confidence, by number or by a click, and followed from then on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -32,6 +33,10 @@ CLICK_M = 0.05
 """How far from a click a part may be."""
 FOLLOW_M = 0.4
 """How far the middle of a part may move from one scan to the next."""
+STILL_M, STILL_SHARE = 0.02, 0.8
+"""A part did not move where this share of its points has a point of the next scan so near."""
+UNMOVED_M = 0.05
+"""How far around a point that was gripped, and that did not move, nothing is marked."""
 PICTURE_POINTS = 60_000
 """Of a raw scan, in the picture of its parts."""
 PARTS_SUFFIX = "-parts"
@@ -164,7 +169,15 @@ class PartFinder:
         self._last: tuple[Scan, Segmentation, tuple[Part, ...]] | None = None
 
     def cut_out(
-        self, scan: Scan, up: Vector, camera: Vector, choice: str, followed: FollowedPart | None, source: str
+        self,
+        scan: Scan,
+        up: Vector,
+        camera: Vector,
+        choice: str,
+        followed: FollowedPart | None,
+        source: str,
+        before: CutOut | None = None,
+        unmoved: Sequence[Vector] = (),
     ) -> CutOut:
         """Cut the object out of a scan and mark one of its parts.
 
@@ -175,6 +188,9 @@ class PartFinder:
             choice: which part is wanted (see `PartChoice.of`).
             followed: the parts of the scan before; the choice then counts no more.
             source: the scan's name in messages.
+            before: an earlier scan; a part that the network does not find again, and that did not move, is as there.
+            unmoved: points that were pulled in vain, frame of the scan; around them the part is not marked, unless that
+                is all of it.
 
         Raises:
             PartError: no such part is found.
@@ -183,33 +199,41 @@ class PartFinder:
         if scan.movable is not None:
             raise UsageError(f"{source}: says itself which points are movable; leave out --part, or 'movable'")
         found, parts = self._parts(scan, up, camera, source)
-        numbered = [
-            FoundPart(
-                number=number,
-                kind="turning" if part.kind is Kind.TURNING else "sliding",
-                confidence=round(part.confidence, 4),
-                centre=_vector(np.median(scan.points[part.points], axis=0)),
-                points=len(part.points),
+        chosen = None if followed is None else _again(_numbered(scan, parts), followed)
+        if chosen is None and before is not None and (still := _still(scan, before)) is not None:
+            chosen, parts = len(parts), (*parts, still)
+        numbered = _numbered(scan, parts)
+        if not parts:
+            kinds = " or ".join(kind.name.lower() for kind in self._kinds)
+            raise PartError(
+                f"{source}: no {kinds} part is found on the object; look from another side, or mark the points to act "
+                "on as 'movable' and leave out --part"
             )
-            for number, part in enumerate(parts, start=1)
-        ]
         if followed is None:
             chosen = _chosen(scan, parts, numbered, PartChoice.of(choice), source)
-        else:
-            chosen = _again(numbered, followed, source)
+        elif chosen is None:
+            raise PartError(
+                f"{source}: the part that was at {_shown(followed.centre)} in the scan before is not found again; scan "
+                f"the object anew under another name, or begin another history. {_listed(numbered)}"
+            )
         shades = np.full(len(scan.points), _BACKGROUND, dtype=np.float32)
         shades[found.object] = _BODY
         for part in parts:
             shades[part.points] = _OTHER
         shades[parts[chosen].points] = _CHOSEN
-        rows = found.object[_on_surfaces(scan.points[found.object])]
+        of_object = np.flatnonzero(shades)
+        rows = of_object[_on_surfaces(scan.points[of_object])]
         if not (shades[rows] == _CHOSEN).any():
-            rows = found.object
+            rows = of_object
+        movable = shades[rows] == _CHOSEN
+        if unmoved:
+            free = cKDTree(np.array(unmoved)).query(scan.points[rows])[0] > UNMOVED_M
+            movable = movable & free if (movable & free).any() else movable
         cut = replace(
             scan,
             points=scan.points[rows],
             normals=None if scan.normals is None else scan.normals[rows],
-            movable=shades[rows] == _CHOSEN,
+            movable=movable,
             rows=rows if scan.rows is None else scan.rows[rows],
         )
         others = tuple(part for number, part in enumerate(numbered) if number != chosen)
@@ -225,12 +249,6 @@ class PartFinder:
                 raise PartError(f"{source}: {error}") from None
             self._last = scan, found, self._suitable(found.parts)[:MAX_PARTS]
         _, found, parts = self._last
-        if not parts:
-            kinds = " or ".join(kind.name.lower() for kind in self._kinds)
-            raise PartError(
-                f"{source}: no {kinds} part is found on the object; look from another side, or mark the points to act "
-                "on as 'movable' and leave out --part"
-            )
         return found, parts
 
     def _suitable(self, parts: tuple[Part, ...]) -> tuple[Part, ...]:
@@ -265,6 +283,19 @@ def read_segmenter(folder: Path) -> Segmenter:
     return Segmenter.from_files({name: read_bounded(folder / name, limit) for name, limit in limits.items()})
 
 
+def _numbered(scan: Scan, parts: tuple[Part, ...]) -> list[FoundPart]:
+    return [
+        FoundPart(
+            number=number,
+            kind="turning" if part.kind is Kind.TURNING else "sliding",
+            confidence=round(part.confidence, 4),
+            centre=_vector(np.median(scan.points[part.points], axis=0)),
+            points=len(part.points),
+        )
+        for number, part in enumerate(parts, start=1)
+    ]
+
+
 def _chosen(scan: Scan, parts: tuple[Part, ...], numbered: list[FoundPart], choice: PartChoice, source: str) -> int:
     if choice.number > len(parts):
         raise UsageError(f"{source}: --part {choice.number}: {_listed(numbered)}; give one of these numbers, or auto")
@@ -281,18 +312,31 @@ def _chosen(scan: Scan, parts: tuple[Part, ...], numbered: list[FoundPart], choi
     return nearest
 
 
-def _again(numbered: list[FoundPart], followed: FollowedPart, source: str) -> int:
-    """The part that was followed, where all parts together moved the least."""
+def _again(numbered: list[FoundPart], followed: FollowedPart) -> int | None:
+    """The part that was followed, where all parts together moved the least; None where it is not found."""
+    if not numbered:
+        return None
     before = np.array([followed.centre, *followed.others])
     away = np.linalg.norm(before[:, None] - np.array([part.centre for part in numbered]), axis=2)
     rows, columns = linear_sum_assignment(np.minimum(away, FOLLOW_M))
     again = {int(row): int(column) for row, column in zip(rows, columns, strict=True)}
-    if 0 not in again or not away[0, again[0]] < FOLLOW_M:
-        raise PartError(
-            f"{source}: the part that was at {_shown(followed.centre)} in the scan before is not found again; scan the "
-            f"object anew under another name, or begin another history. {_listed(numbered)}"
-        )
-    return again[0]
+    return again[0] if 0 in again and away[0, again[0]] < FOLLOW_M else None
+
+
+def _still(scan: Scan, before: CutOut) -> Part | None:
+    """The part of an earlier scan where it did not move; None where it did."""
+    known = np.flatnonzero(before.shades)
+    tree = cKDTree(before.whole.points[known])
+    away, nearest = map(np.asarray, tree.query(scan.points, distance_upper_bound=STILL_M, workers=-1))
+    near = np.flatnonzero(np.isfinite(away))
+    points = near[before.shades[known[nearest[near]]] == _CHOSEN]
+    if len(points) == 0:
+        return None
+    was = before.whole.points[before.shades == _CHOSEN]
+    if np.mean(cKDTree(scan.points[points]).query(was, workers=-1)[0] < STILL_M) < STILL_SHARE:
+        return None
+    chosen = before.answer.chosen
+    return Part(points, {Kind[chosen.kind.upper()]: chosen.confidence})
 
 
 def _listed(numbered: list[FoundPart]) -> str:

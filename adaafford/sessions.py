@@ -45,7 +45,7 @@ from shared.policies.methods import PROPOSERS
 from shared.policies.policy import Policy
 from shared.policies.proposers import AipProposer, ExploitProposer, proposer_named
 from shared.primitives import PRIMITIVES
-from shared.tasks import task_named
+from shared.tasks import TASKS, task_named
 from shared.types import Action, Observation
 
 PURPOSE = "adapt"
@@ -221,7 +221,8 @@ class Session:
         self._up, self._camera, self._lens, self._tell = up, camera, lens, tell
         self._arm, self._base, self._selection, self._proposer = arm, base, selection, proposer
         self._primitive = None if arm is None else PRIMITIVES.get(task_named(policy.task).primitive)
-        self._seen: dict[tuple[str, ScanFrame, FollowedPart | None], _Seen] = {}
+        self._grips = policy.task in TASKS.names() and PRIMITIVES.get(TASKS.get(policy.task).primitive).closes_fingers
+        self._seen: dict[tuple[str, ScanFrame, FollowedPart | None, tuple[Vector, ...]], _Seen] = {}
         self._steps = self._tries = 0
         self._seconds: Seconds | None = None
 
@@ -263,7 +264,8 @@ class Session:
         used: list[_Seen] = []
 
         def observe(cloud: str, wanted: str | None, followed: FollowedPart | None) -> Observation:
-            used.append(self._observe(cloud, wanted, history, followed))
+            before = used[-1].cut if used else None
+            used.append(self._observe(cloud, wanted, history, followed, before, self._unmoved(history, len(used))))
             return used[-1].observation
 
         known = history.interactions_with(lambda each: observe(each.cloud, each.cloud_sha256, each.part))
@@ -378,7 +380,7 @@ class Session:
         frame = ScanFrame.around(scan if cut is None else cut.scan, up, self._camera)
         if self._up is None and (doubt := doubtful_up(scan, frame)):
             self._tell(f"{path}: {doubt}; if so, say it by --up and begin another history")
-        self._remember(scan, cut, path, sha256, frame, None)
+        self._remember(scan, cut, path, sha256, frame, None, ())
         return History(frame=frame, part=self._choice, lens=self._lens)
 
     @cached_property
@@ -426,8 +428,23 @@ class Session:
         except ValueError as error:
             raise UsageError(f"{plain(name)}: {error}; rename the scan") from None
 
-    def _observe(self, name: str, wanted: str | None, history: History, followed: FollowedPart | None) -> "_Seen":
-        """What is seen in a cloud's file.
+    def _unmoved(self, history: History, count: int) -> tuple[Vector, ...]:
+        """The points that were pulled in vain by the first `count` interactions."""
+        if history.part is None or not self._grips:
+            return ()
+        tried = ((each.point, each.outcome) for each in history.tried[:count])
+        return tuple(point for point, outcome in tried if outcome is not None and outcome.held_still)
+
+    def _observe(
+        self,
+        name: str,
+        wanted: str | None,
+        history: History,
+        followed: FollowedPart | None,
+        before: CutOut | None,
+        unmoved: tuple[Vector, ...],
+    ) -> "_Seen":
+        """What is seen in a cloud's file, after what was seen `before`.
 
         It is made once for the same content, since the networks' work on it is remembered with it.
         """
@@ -435,12 +452,14 @@ class Session:
         if wanted not in (None, sha256):
             raise UsageError(f"{path}: was overwritten after its interaction; use a new file name for every scan")
         frame = history.frame
-        if (sha256, frame, followed) not in self._seen:
+        if (sha256, frame, followed, unmoved) not in self._seen:
             scan, cut = self._parsed(data, path, history.part, history.lens), None
             if history.part is not None:
-                cut = self._finder.cut_out(scan, frame.up, frame.camera, history.part, followed, str(path))
-            self._remember(scan, cut, path, sha256, frame, followed)
-        return self._seen[sha256, frame, followed]
+                cut = self._finder.cut_out(
+                    scan, frame.up, frame.camera, history.part, followed, str(path), before, unmoved
+                )
+            self._remember(scan, cut, path, sha256, frame, followed, unmoved)
+        return self._seen[sha256, frame, followed, unmoved]
 
     def _file(self, name: str) -> tuple[Path, bytes, str]:
         """A cloud's path, bytes and hash."""
@@ -453,7 +472,14 @@ class Session:
         return parse_scan(data, path, raw=raw) if lens is None else parse_depth(data, path, lens, raw=raw)
 
     def _remember(
-        self, scan: Scan, cut: CutOut | None, path: Path, sha256: str, frame: ScanFrame, followed: FollowedPart | None
+        self,
+        scan: Scan,
+        cut: CutOut | None,
+        path: Path,
+        sha256: str,
+        frame: ScanFrame,
+        followed: FollowedPart | None,
+        unmoved: tuple[Vector, ...],
     ) -> None:
         if missing := missing_points(scan):
             self._tell(f"{path}: {missing}")
@@ -463,10 +489,10 @@ class Session:
             x, y, z = frame.to_world([self._base[:3]])[0]
             surface = frame.to_world(scan.points[:: 1 + len(scan.points) // SURFACE_POINTS])
             observed = replace(observed, reach=ArmReach(self._arm, (x, y, z, self._base[3]), self._primitive, surface))
-        seen = self._seen[sha256, frame, followed] = _Seen(observed, sha256, cut)
+        seen = self._seen[sha256, frame, followed, unmoved] = _Seen(observed, sha256, cut)
         if cut is not None:
             # So the history names the part from now on.
-            self._seen[sha256, frame, cut.answer.followed] = seen
+            self._seen[sha256, frame, cut.answer.followed, unmoved] = seen
 
 
 def parts_file(heatmap: Path) -> Path:

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from adaafford.histories import TriedOutcome, parse_json
+from adaafford.parts import PartError
 from adaafford.scans import Scan, ScanFrame, action_at, npz_of
 from adaafford.sessions import Request, Session, Step
 from collector.objects.articulation import Body
@@ -256,15 +257,21 @@ def rehearse(
     """
     while True:
         request, executed = robot.request, robot.executed
-        step = session.step(robot.folder / request.cloud, request.outcome, request.interaction)
         acts = [one.step for one in executed if one.step.do == "act"]
+        try:
+            step = session.step(robot.folder / request.cloud, request.outcome, request.interaction)
+        except PartError:
+            if goal is None and acts:
+                break  # The final action was executed; only another one would need the part.
+            raise
         if goal is None and acts:
-            return bool(executed[-1].outcome.success)
+            break
         if goal is not None and (robot.moved >= goal.motion or len(executed) >= goal.within):
             return robot.moved >= goal.motion
         if goal is not None and goal.repeat and acts:
             step = acts[0].model_copy(update={"interaction": step.interaction, "tries": step.tries})
         tell(step, robot.execute(step))
+    return bool(robot.executed[-1].outcome.success)
 
 
 def _action_of(step: Step) -> tuple[object, ...]:

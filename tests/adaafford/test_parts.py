@@ -2,22 +2,24 @@
 
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from adaafford import parts
 from adaafford.histories import TriedOutcome, read_history
-from adaafford.parts import PartChoice, PartError, PartFinder, read_segmenter
-from adaafford.scans import Scan, checked_scan
+from adaafford.parts import UNMOVED_M, CutOut, PartChoice, PartError, PartFinder, read_segmenter
+from adaafford.scans import Scan, Vector, checked_scan
 from adaafford.sessions import Session, SessionFiles, parts_file
 from cluster.cli.main import run as adaafford
 from shared.errors import StoreError, UsageError
 from shared.policies.policy import CORE, WEIGHTS_FILE, Policy
 from shared.segmentation.scenes import Kind
 from shared.segmentation.segmenter import SEGMENTATION_FILE, Part, Segmentation, Segmenter, begun, part_labels
-from shared.types import Float
+from shared.types import Float, OutcomeKind
 from tests.support.small_networks import TINY
 
 UP, CAMERA = (0.0, 0.0, 1.0), (0.0, 0.0, 1.0)
@@ -60,9 +62,9 @@ def write(path: Path, points: Float) -> Path:
     return path
 
 
-def session(folder: Path, part: str | None = "auto") -> Session:
+def session(folder: Path, part: str | None = "auto", task: str = "pull-closed-door") -> Session:
     files = SessionFiles(folder / "history.json", folder / "heatmap.npz")
-    policy = Policy.untrained("pull-closed-door", TINY, 0)
+    policy = Policy.untrained(task, TINY, 0)
     for name in CORE:
         policy.with_trained(name)
     return Session(policy, files, part=part, points=256)
@@ -105,6 +107,76 @@ def test_the_part_is_followed_where_it_moved_to(tmp_path: Path) -> None:
     assert again.model_copy(update={"seconds": later.seconds}) == later
     history = read_history(tmp_path / "history.json")
     assert [each.part is not None for each in history.interactions] == [True, True]
+
+
+class ForgetfulSegmenter(GivenSegmenter):
+    """Does not find the right door where a lamp is seen, which is above z = 2."""
+
+    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+        found = super().segment(points, camera, seed)
+        return found if points[:, 2].max() < 2.0 else Segmentation(found.object, found.parts[:1])
+
+
+def test_a_part_that_is_not_found_again_and_did_not_move_is_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parts, "bundled_segmenter", ForgetfulSegmenter)
+    lamp = [[1.2, 0.0, 2.5]]
+    first, *later = (
+        write(tmp_path / f"scan-{number}.npz", np.concatenate([room() + 0.002 * number, *([lamp] if number else [])]))
+        for number in range(3)
+    )
+    session(tmp_path, "2").step(first)
+    for tries, scan in enumerate(later, start=1):
+        step = session(tmp_path, None).step(scan, TOLD, tries)
+        assert step.tries == tries and step.part is not None
+        assert step.part.chosen.centre[1] < 0 and step.point[1] < 0
+        assert (step.part.chosen.number, step.part.chosen.confidence, step.part.chosen.points) == (2, 0.7, 1500)
+        assert [part.number for part in step.part.alternatives] == [1]
+    moved = write(tmp_path / "scan-3.npz", np.concatenate([room(right=0.7), lamp]))
+    with pytest.raises(PartError, match="is not found again"):
+        session(tmp_path, None).step(moved, TOLD, 3)
+    history = read_history(tmp_path / "history.json")
+    assert len(history.tried) == 2, "what is refused leaves the history as it was"
+
+
+def test_around_points_that_were_pulled_in_vain_nothing_is_marked() -> None:
+    scan, finder = Scan(room()), PartFinder("pull-closed-door")
+
+    def marked(*unmoved: Vector) -> Float:
+        cut = finder.cut_out(scan, UP, CAMERA, "auto", None, "scan", unmoved=unmoved).scan
+        assert cut.movable is not None
+        return cut.points[cut.movable]
+
+    whole, x, y, z = marked(), 0.91, 0.15, 0.4
+    away = np.linalg.norm(whole - [x, y, z], axis=1)
+    assert np.array_equal(marked((x, y, z)), whole[away > UNMOVED_M])
+    everywhere = [(x, float(y), float(z)) for y in np.arange(0.02, 0.3, 0.04) for z in np.arange(0.1, 0.74, 0.04)]
+    assert np.array_equal(marked(*everywhere), whole), "something has to be left"
+
+
+@pytest.mark.parametrize(("policy", "kind", "elsewhere"), [
+    ("pull-closed-door", OutcomeKind.OK, True),
+    ("pull-closed-door", OutcomeKind.NO_CONTACT, False),
+    ("push", OutcomeKind.OK, False),
+])  # fmt: skip
+def test_a_pull_that_moves_nothing_is_not_made_again_there(
+    policy: str, kind: OutcomeKind, elsewhere: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = list[Sequence[Vector]]()
+    cut_out = PartFinder.cut_out
+
+    def spied(finder: PartFinder, *args: Any) -> CutOut:
+        told.append(args[-1])
+        return cut_out(finder, *args)
+
+    first = session(tmp_path, task=policy).step(write(tmp_path / "scan-1.npz", room()))
+    monkeypatch.setattr(PartFinder, "cut_out", spied)
+    again = session(tmp_path, task=policy).step(
+        write(tmp_path / "scan-2.npz", room() + 0.001), TriedOutcome(motion=0.0, kind=kind), 1
+    )
+    assert told == [(), (first.point,) if elsewhere else ()]
+    assert not elsewhere or np.linalg.norm(np.subtract(again.point, first.point)) > UNMOVED_M
 
 
 def test_another_part_may_be_chosen_until_something_was_tried(tmp_path: Path) -> None:

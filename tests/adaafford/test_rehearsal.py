@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from adaafford.histories import TriedOutcome, read_history
+from adaafford.parts import PartError
 from adaafford.pretrained import load_policy
 from adaafford.scans import read_scan
 from adaafford.sessions import Session, SessionFiles, Step
@@ -201,6 +202,27 @@ def test_a_rehearsal_that_is_ended_at_every_write_counts_everything_once(
         assert last == state.executed[-1]
         assert last.step.do == "act"
     assert kills >= 12
+
+
+@pytest.mark.parametrize("succeeded", [True, False])
+def test_a_final_action_counts_where_the_part_is_not_found_after_it(
+    succeeded: bool, make_robot: Callable[..., SimulatedRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SapienEnvironment, "execute", lambda *_: Outcome(OutcomeKind.OK, 0.1, succeeded))
+    robot = make_robot()
+    session = Session(policy_with_all(), SessionFiles(robot.folder / "history.json", None), budget=1, points=256)
+    seen = session.step
+
+    def step(cloud: Path, outcome: TriedOutcome | None = None, interaction: int | None = None) -> Step:
+        if interaction == 2:
+            raise PartError("it is not found again")
+        return seen(cloud, outcome, interaction)
+
+    monkeypatch.setattr(session, "step", step)
+    assert rehearsal.rehearse(robot, session, lambda *_: None) is succeeded
+    assert [one.step.do for one in robot.executed] == ["try", "act"]
+    with pytest.raises(PartError):
+        rehearsal.rehearse(robot, session, lambda *_: None, rehearsal.Goal(50.0, within=4))
 
 
 def test_a_goal_is_pursued_by_several_actions(make_robot: Callable[..., SimulatedRobot], tmp_path: Path) -> None:
