@@ -17,6 +17,7 @@ from shared.errors import StoreError, UsageError
 from shared.plan import Job, Plan
 from shared.store import Store, compact, export, merge, verify
 from shared.store.codecs.observations import ARRAYS
+from shared.store.layout import SHARDS_FOLDER
 from shared.store.maintenance.export import splits_by_share
 from shared.store.maintenance.formats import plain
 from shared.types import pack_normals
@@ -123,7 +124,7 @@ def test_merging_is_a_union(tmp_path: Path, s3_url: str) -> None:
 
 def test_what_a_killed_merge_or_compaction_left_is_removed_by_the_next(tmp_path: Path) -> None:
     one, merged = make(tmp_path / "one", (0, 2)), make(tmp_path / "merged", (0, 2))
-    left = [kill_while_writing(store.shards_folder / "half") for store in (one, merged)]
+    left = [kill_while_writing(store.path / SHARDS_FOLDER / "half") for store in (one, merged)]
     merge([one], merged.where)
     compact(one, 2)
     assert not any(path.exists() for path in left)
