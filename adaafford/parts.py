@@ -199,10 +199,11 @@ class PartFinder:
         if scan.movable is not None:
             raise UsageError(f"{source}: says itself which points are movable; leave out --part, or 'movable'")
         found, parts = self._parts(scan, up, camera, source)
-        chosen = None if followed is None else _again(_numbered(scan, parts), followed)
+        numbered = [_shown_part(scan, part, number) for number, part in enumerate(parts, start=1)]
+        chosen = None if followed is None else _again(numbered, followed)
         if chosen is None and before is not None and (still := _still(scan, before)) is not None:
             chosen, parts = len(parts), (*parts, still)
-        numbered = _numbered(scan, parts)
+            numbered.append(_shown_part(scan, still, len(parts)))
         if not parts:
             kinds = " or ".join(kind.name.lower() for kind in self._kinds)
             raise PartError(
@@ -283,17 +284,14 @@ def read_segmenter(folder: Path) -> Segmenter:
     return Segmenter.from_files({name: read_bounded(folder / name, limit) for name, limit in limits.items()})
 
 
-def _numbered(scan: Scan, parts: tuple[Part, ...]) -> list[FoundPart]:
-    return [
-        FoundPart(
-            number=number,
-            kind="turning" if part.kind is Kind.TURNING else "sliding",
-            confidence=round(part.confidence, 4),
-            centre=_vector(np.median(scan.points[part.points], axis=0)),
-            points=len(part.points),
-        )
-        for number, part in enumerate(parts, start=1)
-    ]
+def _shown_part(scan: Scan, part: Part, number: int) -> FoundPart:
+    return FoundPart(
+        number=number,
+        kind="turning" if part.kind is Kind.TURNING else "sliding",
+        confidence=round(part.confidence, 4),
+        centre=_vector(np.median(scan.points[part.points], axis=0)),
+        points=len(part.points),
+    )
 
 
 def _chosen(scan: Scan, parts: tuple[Part, ...], numbered: list[FoundPart], choice: PartChoice, source: str) -> int:

@@ -17,7 +17,7 @@ from shared.io.documents import with_checksum
 from shared.plan import Job, RolloutRecord, missing_ranges
 from shared.progress import Advance
 from shared.store import Store
-from shared.store.layout import MANIFEST_FILE
+from shared.store.layout import MANIFEST_FILE, SHARDS_FOLDER
 
 COMMITS = 7
 """The median of these counts."""
@@ -83,7 +83,7 @@ class ListingBenchmark:
         content: dict[str, Any] = self._manifest.model_dump(mode="json")
         for number in range(there, size):
             job = self._job(number)
-            folder = self._store.path / "shards" / job.shard_id
+            folder = self._store.path / SHARDS_FOLDER / job.shard_id
             folder.mkdir(parents=True)
             (folder / MANIFEST_FILE).write_bytes(with_checksum(content | {"start": job.start, "stop": job.stop}))
 

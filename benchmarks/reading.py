@@ -17,7 +17,7 @@ from cluster.cli.commands.bench import StoredSettings, source_of, stored
 from shared.errors import StoreError
 from shared.progress import Progress
 from shared.store import Store
-from shared.store.layout import INTERACTIONS_FILE, OBSERVATIONS_FOLDER
+from shared.store.layout import INTERACTIONS_FILE, OBSERVATIONS_FOLDER, SHARDS_FOLDER
 from shared.store.streaming import InteractionDataset
 
 COLUMNS = ("point_index", "point", "rotation", "motion", "success")
@@ -33,7 +33,7 @@ class ReadingSettings(StoredSettings):
 def measure(command: ReadingSettings) -> dict[str, Any]:
     """Measure, and print a table."""
     with stored(command) as store:
-        shards = [store.path / "shards" / part.shard.shard_id for part in store.parts()]
+        shards = [store.path / SHARDS_FOLDER / part.shard.shard_id for part in store.parts()]
         rows = store.interactions(COLUMNS)
         if not len(rows):
             raise StoreError(f"{store.where}: holds no interaction; collect some first")

@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from types import TracebackType
 from typing import NoReturn
@@ -88,9 +88,7 @@ def main() -> NoReturn:
             code = _run(args)
         finally:
             # A second signal must not interrupt the report of the first.
-            for number in ENDING:
-                if signal.getsignal(number) is not signal.SIG_IGN:
-                    signal.signal(number, _pass_over)
+            _answer(ENDING, _pass_over)
     except KeyboardInterrupt:
         code = _interrupted(args)
     except _Ended as ended:
@@ -98,9 +96,7 @@ def main() -> NoReturn:
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else _complain(str(stop.code), 1) if stop.code else 0
     # All is done and said, so that a signal may end the process at once, without a traceback.
-    for number in ENDING:
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, signal.SIG_DFL)
+    _answer(ENDING, signal.SIG_DFL)
     sys.exit(streams.settle(code))
 
 
@@ -129,10 +125,8 @@ def begin_process(*, stop_at_pipe: bool = False) -> Streams:
         # loop keeps the processor from the very thread that it waits for.
         os.environ.setdefault("GOMP_SPINCOUNT", str(SPINS))
     sys.excepthook = _show_traceback
-    # As Ctrl-C does, so that workers and learners are ended in an orderly way; `nohup` has SIGHUP ignored.
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _end)
+    # As Ctrl-C does, so that workers and learners are ended in an orderly way.
+    _answer((signal.SIGTERM, signal.SIGHUP), _end)
     return streams
 
 
@@ -190,6 +184,13 @@ def _told(command: Callable[[], int], args: list[str]) -> int:
         place = f"{error.filename}: " if error.filename else ""
         return _complain(f"{place}{error.strerror or error}; correct this and run the same command again", 1)
     return code
+
+
+def _answer(numbers: Iterable[signal.Signals], handler: Callable[[int, object], object] | signal.Handlers) -> None:
+    """Handle signals, except for those that whoever started this process has ignored, as `nohup` has SIGHUP."""
+    for number in numbers:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 class _Ended(SystemExit):

@@ -27,6 +27,16 @@ def complaint(capsys: pytest.CaptureFixture[str], *args: str) -> str:
     return err
 
 
+def with_signals(*lines: str) -> "subprocess.CompletedProcess[str]":
+    """The command line in a process that ignores no signal, after some lines of Python that change it."""
+    begin = (
+        "import signal, sys; from cluster.cli import main",
+        "signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL)",
+    )
+    script = "\n".join((*begin, *lines, "main.main()"))
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+
+
 def test_help_imports_nothing_heavy() -> None:
     script = (
         "import sys; from cluster.cli.main import run; assert run(['--help']) == 0;"
@@ -108,14 +118,10 @@ def test_a_picture_of_another_kind_is_refused(capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_says_how_to_go_on(number: signal.Signals) -> None:
-    script = (
-        "import signal, sys; from cluster.cli import main\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
-        f"main._run = lambda args: signal.raise_signal({int(number)})\n"
-        "sys.argv[1:] = ['collect', '--store', 'my store']\n"
-        "main.main()"
+    done = with_signals(
+        f"main._run = lambda args: signal.raise_signal({int(number)})",
+        "sys.argv[1:] = ['collect', '--store', 'my store']",
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 128 + number
     assert done.stderr == (
         "adaafford: interrupted; committed data stay, and the same command continues: "
@@ -237,15 +243,11 @@ def test_an_interrupt_is_one_line_that_says_whether_the_same_command_continues(
 def test_a_second_signal_does_not_disturb_the_report_of_the_first(
     first: signal.Signals, second: signal.Signals
 ) -> None:
-    script = (
-        "import signal, sys; from cluster.cli import main\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
-        f"main._run = lambda args: signal.raise_signal({int(first)})\n"
-        f"main.plain = lambda text: [text, signal.raise_signal({int(second)})][0]\n"
-        "sys.argv[1:] = ['resume', 'RUN']\n"
-        "main.main()"
+    done = with_signals(
+        f"main._run = lambda args: signal.raise_signal({int(first)})",
+        f"main.plain = lambda text: [text, signal.raise_signal({int(second)})][0]",
+        "sys.argv[1:] = ['resume', 'RUN']",
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 128 + first
     assert done.stderr == (
         "adaafford: interrupted; committed data stay, and the same command continues: adaafford resume RUN\n"
@@ -253,13 +255,9 @@ def test_a_second_signal_does_not_disturb_the_report_of_the_first(
 
 
 def test_a_second_interrupt_after_the_report_ends_the_process_without_a_traceback() -> None:
-    script = (
-        "import signal, sys; from cluster.cli import main\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "def interrupt(*_): signal.raise_signal(signal.SIGINT)\n"
-        "main._run = main.Streams.settle = interrupt\n"
-        "main.main()"
+    done = with_signals(
+        "def interrupt(*_): signal.raise_signal(signal.SIGINT)",
+        "main._run = main.Streams.settle = interrupt",
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == -signal.SIGINT
     assert "Traceback" not in done.stderr
