@@ -145,16 +145,13 @@ def _convex_shape(mesh: Mesh, material: physx.PhysxMaterial) -> physx.PhysxColli
 
 
 def convex_shapes(link: Link) -> tuple[Mesh, ...]:
-    """What a link collides as: the vertices of its convex pieces, in its frame."""
-    return tuple(
-        Mesh(np.asarray(shape.vertices, dtype=np.float64), np.zeros((0, 3), dtype=np.int32))
-        for shape in link.collision_shapes
-    )
+    """What a link collides as: its convex pieces, in its frame, with outward faces."""
+    return tuple(_mesh(shape) for shape in link.collision_shapes)
 
 
-def half_spaces(shape: physx.PhysxCollisionShapeConvexMesh) -> tuple[Float, Float]:
-    """A convex piece as n . x <= d: normals [F, 3] and distances [F], frame of its link."""
-    corners = np.asarray(shape.vertices, dtype=np.float64)[np.asarray(shape.triangles)]
+def half_spaces(piece: Mesh) -> tuple[Float, Float]:
+    """A convex piece as n . x <= d: outward normals [F, 3] of its faces and distances [F]."""
+    corners = piece.vertices[piece.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
     normals, corners = normals[lengths > 0] / lengths[lengths > 0, None], corners[lengths > 0]
@@ -174,6 +171,8 @@ def set_mass(link: Link, mass: float) -> None:
 def cooked(mesh: Mesh) -> Mesh | None:
     """The convex piece that the engine makes of a mesh, with outward faces; None where it makes none."""
     shape = _convex_shape(mesh, physx.PhysxMaterial(0.0, 0.0, 0.0))
-    if shape is None:
-        return None
+    return None if shape is None else _mesh(shape)
+
+
+def _mesh(shape: physx.PhysxCollisionShapeConvexMesh) -> Mesh:
     return Mesh(np.asarray(shape.vertices, dtype=np.float64), np.asarray(shape.triangles, dtype=np.int32))

@@ -5,58 +5,84 @@ The engine does not answer that: it lists contact points of pairs that are apart
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from collector.sim.engine import Link, half_spaces
+from collector.objects.articulation import ArticulatedObject, Mesh
+from collector.sim.engine import Link, convex_shapes, half_spaces
 from shared.types import Float
 
 PARALLEL = 1e-3
 """Sine of an angle below which two axes are taken for one."""
+STANDS = 1e-30
+"""m: what comes nearer by less than this in a step is taken to do so by this."""
+
+
+class Piece:
+    """A convex piece of a link, in the link's frame.
+
+    Args:
+        mesh: with outward faces.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._mesh = mesh
+
+    @property
+    def corners(self) -> Float:
+        """[V, 3]."""
+        return self._mesh.vertices
+
+    @cached_property
+    def half_spaces(self) -> tuple[Float, Float]:
+        """Outward normals [F, 3] of its faces and offsets [F]: for all of the piece, normal . x <= offset."""
+        normals = half_spaces(self._mesh)[0]
+        # Not from the faces' own corners: the normal of a sliver may be anything.
+        return normals, (normals @ self.corners.T).max(axis=1)
 
 
 @dataclass(frozen=True, slots=True)
 class Pieces:
-    """The convex pieces of one link, in its frame.
+    """The convex pieces of some links, in order of these, with a box of each along the axes of its link.
 
     Attributes:
-        vertices: [V, 3], of all pieces, one after the other.
-        vertex_starts: [P], the first vertex of each piece.
-        normals: [F, 3], outward, of the faces of all pieces.
-        offsets: [F], of the faces: for all of a piece, normal . x <= offset.
-        face_starts: [P], the first face of each piece.
-        centre: [3], of a sphere around all of them.
-        radius: of that sphere.
+        each: the pieces.
+        of_link: [P], the link of each.
+        centres: [P, 4], of the boxes, frame of the link, as matrices take them: the last is 1.
+        halves: [P, 3], half the lengths of their edges.
     """
 
-    vertices: Float
-    vertex_starts: NDArray[np.int64]
-    normals: Float
-    offsets: Float
-    face_starts: NDArray[np.int64]
-    centre: Float
-    radius: float
+    each: tuple[Piece, ...]
+    of_link: NDArray[np.int64]
+    centres: Float
+    halves: Float
 
 
-def pieces_of(link: Link) -> Pieces | None:
-    """What a link collides as; None if it does not collide."""
-    corners = [np.asarray(shape.vertices, dtype=np.float64) for shape in link.collision_shapes]
-    if not corners:
-        return None
-    normals = [half_spaces(shape)[0] for shape in link.collision_shapes]
-    vertices = np.concatenate(corners)
-    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    return Pieces(
-        vertices=vertices,
-        vertex_starts=_starts(len(of_piece) for of_piece in corners),
-        normals=np.concatenate(normals),
-        # Not from the faces' own corners: the normal of a sliver may be anything.
-        offsets=np.concatenate([(n @ of_piece.T).max(axis=1) for n, of_piece in zip(normals, corners, strict=True)]),
-        face_starts=_starts(len(of_piece) for of_piece in normals),
-        centre=centre,
-        radius=float(np.linalg.norm(vertices - centre, axis=1).max()),
-    )
+def pieces_of(links: Sequence[Link]) -> Pieces:
+    """What links collide as."""
+    by_link = [[Piece(mesh) for mesh in convex_shapes(link)] for link in links]
+    each = tuple(piece for pieces in by_link for piece in pieces)
+    corners = np.concatenate([np.zeros((0, 3)), *(piece.corners for piece in each)])
+    starts = _starts(len(piece.corners) for piece in each)
+    low, high = (extreme.reduceat(corners, starts, axis=0) if each else corners for extreme in (np.minimum, np.maximum))
+    of_link = np.repeat(np.arange(len(links)), [len(pieces) for pieces in by_link])
+    centres = np.append((low + high) / 2, np.ones((len(each), 1)), axis=1)
+    return Pieces(each, of_link, centres, (high - low) / 2)
+
+
+def pieces_of_object(target: ArticulatedObject, links: Sequence[Link]) -> Pieces:
+    """What an object collides as, the same in every scene; read from `links`, those of one of them, at the first."""
+    pieces = _OBJECTS.get(target)
+    if pieces is None:
+        pieces = _OBJECTS[target] = pieces_of(links)
+    return pieces
+
+
+_OBJECTS: WeakKeyDictionary[ArticulatedObject, Pieces] = WeakKeyDictionary()
+"""Of the objects that somebody still holds."""
 
 
 def _starts(counts: Iterable[int]) -> NDArray[np.int64]:
@@ -69,12 +95,19 @@ class FreeSpace:
     Args:
         hand: the hand's links; poses count from the first one, its palm.
         links: the object's.
+        pieces: of `links`.
+
+    Attributes:
+        pieces: likewise.
     """
 
-    def __init__(self, hand: Sequence[Link], links: Sequence[Link]) -> None:
-        self._palm = hand[0]
-        self._hand = [(link, pieces) for link in hand if (pieces := pieces_of(link))]
-        self._object = [(link, pieces) for link in links if (pieces := pieces_of(link))]
+    def __init__(self, hand: Sequence[Link], links: Sequence[Link], pieces: Pieces) -> None:
+        of_hand = pieces_of(hand)
+        self._hand, self._links, self.pieces = hand, links, pieces
+        corners = np.concatenate([piece.corners for piece in of_hand.each])
+        self._corners = np.append(corners, np.ones((len(corners), 1)), axis=1)
+        counts = [len(piece.corners) for piece in of_hand.each]
+        self._starts, self._of_corner = _starts(counts), np.repeat(of_hand.of_link, counts)
 
     def steps(self, world_from_hand: Float, stride: Float, most: int, margin: float) -> int:
         """How many steps the hand can move without coming nearer to the object than `margin`, `most` at most.
@@ -87,55 +120,104 @@ class FreeSpace:
             most: steps that are asked for.
             margin: m.
         """
-        palm_from_world = np.linalg.inv(_matrix(self._palm))
-        placed = [_moved(pieces.vertices, palm_from_world @ _matrix(link)) for link, pieces in self._hand]
-        corners = np.concatenate(placed)
-        counts = np.cumsum([0, *map(len, placed)])
-        starts = np.concatenate([pieces.vertex_starts + n for (_, pieces), n in zip(self._hand, counts, strict=False)])
-        low, high = np.minimum.reduceat(corners, starts), np.maximum.reduceat(corners, starts)
+        corners, pieces = self._placed_corners(), self.pieces
         way = most * stride
-        nearest = low.min(axis=0) + np.minimum(way, 0.0) - margin, high.max(axis=0) + np.maximum(way, 0.0) + margin
-        hand_from_world = np.linalg.inv(world_from_hand)
+        low = corners.min(axis=0) + np.minimum(way, 0.0) - margin
+        high = corners.max(axis=0) + np.maximum(way, 0.0) + margin
+        hand_from_pieces = _seen_from(world_from_hand, _matrices(self._links))[pieces.of_link]
+        centres = (hand_from_pieces @ pieces.centres[:, :, None])[:, :, 0]
+        reach = (np.abs(hand_from_pieces[:, :, :3]) @ pieces.halves[:, :, None])[:, :, 0]
+        near = ((centres - reach <= high) & (centres + reach >= low)).all(axis=1).nonzero()[0]
+        if not len(near):
+            return most
+        turns = hand_from_pieces[near, :, :3]
+        axes = _axes(turns)
+        hand = _ends(axes @ corners.T, self._starts)
+        closing = axes @ stride
+        paces = 1.0 / np.maximum(closing, STANDS), 1.0 / np.maximum(-closing, STANDS)
+        middle = (axes @ centres[near, :, None])[:, :, 0]
+        spread = (np.abs(axes @ turns) @ pieces.halves[near, :, None])[:, :, 0]
+        at_least = _steps_along(hand, (middle - spread, middle + spread), paces, margin).min(axis=1)
         free = float(most)
-        for link, pieces in self._object:
-            hand_from_link = hand_from_world @ _matrix(link)
-            centre = hand_from_link[:3, :3] @ pieces.centre + hand_from_link[:3, 3]
-            beside = centre - np.clip(centre, *nearest)
-            if beside @ beside > pieces.radius**2:
-                continue
-            normals = pieces.normals @ hand_from_link[:3, :3].T
-            beyond = np.minimum.reduceat(normals @ corners.T, starts, axis=1)
-            room = beyond - (pieces.offsets + normals @ hand_from_link[:3, 3])[:, None]
-            by_faces = _steps_until(room, -(normals @ stride)[:, None], margin)
-            axes = _axes(hand_from_link[:3, :3])
-            reach, extent = corners @ axes.T, _moved(pieces.vertices, hand_from_link) @ axes.T
-            closing, of_piece = axes @ stride, pieces.vertex_starts
-            before = np.minimum.reduceat(extent, of_piece)[:, None] - np.maximum.reduceat(reach, starts)
-            behind = np.minimum.reduceat(reach, starts) - np.maximum.reduceat(extent, of_piece)[:, None]
-            by_axes = np.maximum(_steps_until(before, closing, margin), _steps_until(behind, -closing, margin))
-            by_faces = np.maximum.reduceat(by_faces, pieces.face_starts)
-            free = min(free, float(np.maximum(by_faces, by_axes.max(axis=2)).min()))
-        return int(free)
+        for k in at_least.argsort():
+            if at_least[k] >= free:
+                break
+            piece, matrix = pieces.each[near[k]], hand_from_pieces[near[k]]
+            along = axes[k] @ _moved(piece.corners, matrix).T
+            of_hand, of_axes = (hand[0][k], hand[1][k]), (paces[0][k], paces[1][k])
+            by_axes = _steps_along(of_hand, (along.min(axis=1), along.max(axis=1)), of_axes, margin)
+            normals, offsets = piece.half_spaces
+            normals = normals @ turns[k].T
+            begins = np.minimum.reduceat(normals @ corners.T, self._starts, axis=1)
+            room = begins - (offsets + normals @ matrix[:3, 3] + margin)[:, None]
+            by_faces = (room / np.maximum(-(normals @ stride), STANDS)[:, None]).max(axis=0)
+            free = min(free, float(np.maximum(by_faces, by_axes).min()))
+        return int(max(free, 0.0))
+
+    def _placed_corners(self) -> Float:
+        """[C, 3], of all pieces of the hand, in the frame of its palm."""
+        matrices = _matrices(self._hand)
+        placed = _seen_from(matrices[0], matrices)[self._of_corner]
+        return np.asarray((placed @ self._corners[:, :, None])[:, :, 0])
 
 
-def _axes(hand_from_link: Float) -> Float:
-    """Unit vectors, [A, 3], hand frame, that separate boxes along the axes of the hand and of a link."""
-    crossed = np.cross(np.eye(3)[:, None], hand_from_link.T[None]).reshape(9, 3)
-    lengths = np.linalg.norm(crossed, axis=1)
-    apart = lengths > PARALLEL
-    return np.concatenate([np.eye(3), crossed[apart] / lengths[apart, None]])
+def _axes(hand_from_links: Float) -> Float:
+    """Axes that separate boxes along the axes of the hand and of a link, for some links; of length 1, or 0 if parallel.
+
+    Args:
+        hand_from_links: rotations, [..., 3, 3].
+
+    Returns:
+        [..., 15, 3], hand frame.
+    """
+    own = hand_from_links.swapaxes(-1, -2)
+    axes = np.zeros((*own.shape[:-2], 15, 3))
+    axes[..., :3, :] = np.eye(3)
+    axes[..., 3:6, :] = own
+    # Those of the hand across those of the link.
+    axes[..., 6:9, 1], axes[..., 6:9, 2] = -own[..., 2], own[..., 1]
+    axes[..., 9:12, 0], axes[..., 9:12, 2] = own[..., 2], -own[..., 0]
+    axes[..., 12:, 0], axes[..., 12:, 1] = -own[..., 1], own[..., 0]
+    lengths = np.sqrt((axes * axes).sum(axis=-1, keepdims=True))
+    axes *= (lengths > PARALLEL) / np.maximum(lengths, PARALLEL)
+    return axes
 
 
-def _steps_until(room: Float, closing: Float, margin: float) -> Float:
-    """Steps until what is `room` apart along an axis, and comes nearer by `closing` a step, is `margin` apart."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        steps = np.where(closing > 0, (room - margin) / closing, np.inf)
-    return np.where(room >= margin, steps, 0.0)
+def _ends(along: Float, starts: NDArray[np.int64]) -> tuple[Float, Float]:
+    """Where pieces begin and where they end, [..., pieces], of where their corners are, [..., corners]."""
+    return np.minimum.reduceat(along, starts, axis=-1), np.maximum.reduceat(along, starts, axis=-1)
 
 
-def _matrix(link: Link) -> Float:
-    return np.asarray(link.entity_pose.to_transformation_matrix(), dtype=np.float64)
+def _steps_along(
+    hand: tuple[Float, Float], piece: tuple[Float, Float], paces: tuple[Float, Float], margin: float
+) -> Float:
+    """Steps until pieces are no more than `margin` apart along each of some axes, [..., pieces of the hand].
+
+    Less than 0 where they are so from the start.
+
+    Args:
+        hand: where each piece of the hand begins and ends along each axis, [..., axes, pieces of the hand].
+        piece: where a piece of the object does, [..., axes].
+        paces: steps that the hand takes for a metre along each axis, forth and back, [..., axes].
+        margin: m.
+    """
+    before = ((piece[0] - margin)[..., None] - hand[1]) * paces[0][..., None]
+    behind = (hand[0] - (piece[1] + margin)[..., None]) * paces[1][..., None]
+    return np.asarray(np.maximum(before, behind).max(axis=-2))
+
+
+def _matrices(links: Sequence[Link]) -> Float:
+    """world_from_link, [links, 4, 4]."""
+    return np.array([link.entity_pose.to_transformation_matrix() for link in links], dtype=np.float64)
+
+
+def _seen_from(world_from_frame: Float, world_from_links: Float) -> Float:
+    """frame_from_link, [links, 3, 4], of a rigid frame, [4, 4], and links, [links, 4, 4]."""
+    apart = world_from_links[:, :3].copy()
+    apart[:, :, 3] -= world_from_frame[:3, 3]
+    return np.asarray(world_from_frame[:3, :3].T @ apart)
 
 
 def _moved(points: Float, matrix: Float) -> Float:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
+    """Points, [P, 3], by a rigid matrix, [3, 4]."""
+    return points @ matrix[:, :3].T + matrix[:, 3]

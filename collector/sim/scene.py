@@ -12,7 +12,7 @@ import numpy as np
 
 from collector.objects.articulation import ArticulatedObject, Joint
 from collector.sim.engine import Assembly, Link, new_scene, physx, pose, sapien, set_mass
-from collector.sim.flight import FreeSpace
+from collector.sim.flight import FreeSpace, pieces_of_object
 from collector.sim.grippers import GRIPPERS
 from collector.sim.mechanisms import FRICTION_DAMPING, Holds
 from collector.sim.shortcuts import CONTACT_RANGE, SHORTCUTS
@@ -106,7 +106,8 @@ class Scene:
     @cached_property
     def free_space(self) -> FreeSpace:
         """Around the object, for the hand to fly in."""
-        return FreeSpace([self.gripper.palm, *self.gripper.fingers], self._links)
+        pieces = pieces_of_object(self.object, self._links)
+        return FreeSpace([self.gripper.palm, *self.gripper.fingers], self._links, pieces)
 
     @property
     def links(self) -> list[Link]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from collector.objects.articulation import Mesh
-from collector.sim.engine import Assembly, Link, half_spaces, physx, pose, sapien
+from collector.sim.engine import Assembly, Link, convex_shapes, half_spaces, physx, pose, sapien
 from collector.sim.gripper import TIP_DISTANCE, Gripper, build_free, convex, frame, make_weightless
 from collector.sim.jointed_gripper import build_jointed
 from shared.types import Float
@@ -148,7 +148,7 @@ class SuctionGripper:
     def _sealed_link(self, world_from_lip: Float) -> Link | None:
         """The link that the cup seals on, where it seals on one."""
         if self._pieces is None:
-            self._pieces = [(link, [half_spaces(shape) for shape in link.collision_shapes]) for link in self._links]
+            self._pieces = [(link, [half_spaces(piece) for piece in convex_shapes(link)]) for link in self._links]
         angles = np.linspace(0, 2 * np.pi, RIM_POINTS, endpoint=False)
         rim = np.stack([RADIUS * np.cos(angles), RADIUS * np.sin(angles), np.zeros(RIM_POINTS)], axis=1)
         depths = np.full((len(self._pieces), RIM_POINTS), np.inf)

@@ -1,21 +1,23 @@
 """The hand flies up to the object and not into it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from collector.objects.articulation import ArticulatedObject
+from collector.objects.articulation import ArticulatedObject, Body, Joint
 from collector.sim.engine import Link, convex_shapes
-from collector.sim.gripper import frame
+from collector.sim.flight import FreeSpace, pieces_of
+from collector.sim.gripper import convex, frame
 from collector.sim.scene import Scene
 from collector.sim.trial import CLEARANCE, Trial
 from shared.config import Fidelity, FidelityVersion
 from shared.geometry import gripper_rotation
 from shared.primitives import PRIMITIVES, hand_start
 from shared.types import Action, Float, HiddenDynamics
-from tests.support.single_door import door, drawer, latched_door
+from tests.support.single_door import base_with, box, door, drawer, latched_door
 
 EASY = HiddenDynamics({"part_mass": 0.2, "joint_friction": 0.05, "surface_friction": 1.0})
 UP: Float = np.array([0.0, 0.0, 1.0])
@@ -76,6 +78,8 @@ def placed(link: Link, moved: Float) -> list[Float]:
 
 def meet(one: Float, other: Float) -> bool:
     """Whether two convex hulls have a point in common: weights of the corners of both that give the same point."""
+    if (one.min(axis=0) > other.max(axis=0)).any() or (other.min(axis=0) > one.max(axis=0)).any():
+        return False
     same = np.concatenate([one, -other]).T
     sums = np.zeros((2, len(one) + len(other)))
     sums[0, : len(one)] = sums[1, len(one) :] = 1.0
@@ -117,3 +121,49 @@ def test_free_space_counts_the_margin_and_what_the_hand_comes_nearer() -> None:
         assert steps == int((room - margin) / 1e-3)
     assert scene.free_space.steps(start, np.array([0.0, 0.0, -1e-3]), 70, 0.001) == 70
     assert scene.free_space.steps(start, np.array([0.0, 0.0, 1e-3]), 1000, 0.04) == 0
+
+
+def scattered(rng: np.random.Generator, count: int) -> ArticulatedObject:
+    """Hulls of eight points, 4 to 20 cm large, around the way of the hand, each a part of its own."""
+    bodies = []
+    for k in range(count):
+        corners = rng.uniform(-1.0, 1.0, (8, 3)) * rng.uniform(0.02, 0.1, 3)
+        shape = convex([(float(x), float(y), float(z)) for x, y, z in corners])
+        along, across = rng.normal(size=(2, 3))
+        at = frame(gripper_rotation(along / np.linalg.norm(along), across), rng.uniform(-0.2, 0.2, 3))
+        joint = Joint(f"slide-{k}", "prismatic", 0, at, np.array([1.0, 0.0, 0.0]), 0.0, 0.1)
+        bodies.append(Body(f"block-{k}", "drawer", joint, (shape,), (shape,)))
+    base = base_with(box((2.0, 0.0, 0.0), (2.1, 0.1, 0.1)), bodies[0])
+    return replace(base, bodies=(base.bodies[0], *bodies))
+
+
+@pytest.mark.parametrize("opened", [False, True], ids=["closed fingers", "open fingers"])
+def test_free_space_among_many_pieces_ends_before_the_nearest_one(opened: bool) -> None:
+    """What is not looked at closely decides nothing: all pieces together give the least that any gives alone."""
+    rng = np.random.default_rng(7)
+    spec, ended = PRIMITIVES.get("pull"), 0
+    for _ in range(2):
+        target = scattered(rng, 60)
+        scene = Scene(target, EASY, Fidelity(version=4), spec)
+        scene.put(np.zeros(len(target.parts)))
+        hand = [scene.gripper.palm, *scene.gripper.fingers]
+        apart = [FreeSpace(hand, [link], pieces_of([link])) for link in scene.links]
+        for _ in range(30):
+            action = tilted((0.0, 0.0, 0.0), tuple(rng.normal(size=3)), rng.normal(size=3))
+            origin = hand_start(action) - 0.25 * action.approach
+            scene.gripper.place(action.rotation, origin, opened=opened)
+            start = frame(action.rotation, origin)
+            stride = rng.normal(size=3) * 1e-5 + np.array([0.0, 0.0, 1e-4])
+            steps = scene.free_space.steps(start, stride, 5000, CLEARANCE)
+            assert steps == min(space.steps(start, stride, 5000, CLEARANCE) for space in apart)
+            if steps:
+                assert not overlap(scene, start @ frame(np.eye(3), steps * stride))
+            ended += 0 < steps < 5000
+    assert ended > 10
+
+
+def test_scenes_of_an_object_share_what_flights_look_at() -> None:
+    target, spec = door(), PRIMITIVES.get("pull")
+    first, second = (Scene(target, EASY, Fidelity(version=4), spec).free_space for _ in range(2))
+    assert first.pieces is second.pieces
+    assert first.pieces is not Scene(door(), EASY, Fidelity(version=4), spec).free_space.pieces
