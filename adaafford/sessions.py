@@ -43,7 +43,7 @@ from shared.io.text import plain
 from shared.policies.adaptation import Adapter
 from shared.policies.methods import PROPOSERS
 from shared.policies.policy import Policy
-from shared.policies.proposers import AipProposer, ExploitProposer, proposer_named
+from shared.policies.proposers import AipProposer, RepeatProposer, proposer_named
 from shared.primitives import PRIMITIVES
 from shared.tasks import TASKS, task_named
 from shared.types import Action, Observation
@@ -279,7 +279,7 @@ class Session:
             action = proposer_named(self._proposer, self._adapter, rng, self._budget).propose(observation, known)
         do: Literal["try", "act"] = "act" if action is None else "try"
         if action is None:
-            action = ExploitProposer(self._adapter, rng, share=FINAL_SHARE).propose(observation, known)
+            action = RepeatProposer(self._adapter, rng, share=FINAL_SHARE).propose(observation, known)
             assert action is not None, "an exploiter never stops"
         trajectory = self._trajectory(observation, action, cloud)
         belief = float(self._adapter.score(observation, [action], known)[0])
