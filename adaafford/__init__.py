@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from shared.errors import AdaAffordError
     from shared.policies.adaptation import Adapter
     from shared.policies.policy import Policy
-    from shared.policies.proposers import AipProposer, ExploitProposer
+    from shared.policies.proposers import AipProposer, ExploitProposer, RepeatProposer
     from shared.store import Store
     from shared.store.streaming import InteractionDataset
     from shared.types import Action, Environment, Interaction, Observation, Outcome, OutcomeKind, Proposer
@@ -49,7 +49,7 @@ else:
         "shared.policies.adaptation": ("Adapter",),
         "shared.errors": ("AdaAffordError",),
         "shared.policies.policy": ("Policy",),
-        "shared.policies.proposers": ("AipProposer", "ExploitProposer"),
+        "shared.policies.proposers": ("AipProposer", "ExploitProposer", "RepeatProposer"),
         "shared.store": ("Store",),
         "shared.store.streaming": ("InteractionDataset",),
         "shared.types": (
@@ -87,6 +87,7 @@ __all__ = [
     "OutcomeKind",
     "Policy",
     "Proposer",
+    "RepeatProposer",
     "ScanFrame",
     "Store",
     "__version__",

@@ -164,8 +164,7 @@ def fit_for_hints(policy: Policy, task: str) -> None:
         UsageError: it has no AAP, or is of another task.
     """
     policy.require("aap")
-    if policy.task != task:
-        raise UsageError(f"a policy for '{policy.task}', but the tries are of '{task}'; use one of its task")
+    policy.require_task(task, "--policy", "the tries are of")
 
 
 def hints_of(rollout: RolloutRecord, affordance: Callable[..., Float32]) -> list[Hint]:

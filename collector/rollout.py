@@ -19,7 +19,7 @@ from shared.config import DynamicsRanges, Range
 from shared.geometry import camera_pose
 from shared.hidden import ALWAYS_DRAWN
 from shared.plan import ObjectRef, Plan, RolloutRecord, RolloutStatus
-from shared.policies.methods import METHODS, MethodName
+from shared.policies.methods import METHODS, REPEATING, MethodName
 from shared.tasks import Task
 from shared.types import Float, HiddenDynamics, Interaction, Order, Proposer, Role
 
@@ -297,18 +297,33 @@ def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: Proposer
             most = method.budgets(config.budgets)[-1]
             history = recorder.interact(context, most, Role.CONTEXT_BY_SHARE, method=name)
         exploiter = make_proposer(method.critic, rng(f"exploit-by-share/{name}"), version, config.exploit_share)
-        _exploit_by_share(recorder, name, history, exploiter, method.budgets(config.budgets), start)
+        role = Role.EXPLOIT_BY_SHARE
+        _act_at_start(recorder, role, name, history, exploiter, method.budgets(config.budgets), start)
+    for name, history in tried.items() if config.repeats else ():
+        method = METHODS.get(name)
+        if method.tries is None:
+            continue
+        version = method.policy_version(plan.policy_version)
+        recorder.policy_version = version
+        repeater = make_proposer(f"{REPEATING}{method.critic}", rng(f"repeat/{name}"), version, config.exploit_share)
+        role = Role.REPEAT_AT_START
+        _act_at_start(recorder, role, name, history, repeater, method.budgets(config.budgets), start)
 
 
-def _exploit_by_share(
-    recorder: Recorder, method: str, tried: list[Interaction], exploiter: Proposer, budgets: list[int], start: Float
+def _act_at_start(
+    recorder: Recorder,
+    role: Role,
+    method: str,
+    tried: list[Interaction],
+    exploiter: Proposer,
+    budgets: list[int],
+    start: Float,
 ) -> None:
     """At each budget, execute what the method would do after its first interactions, where they began."""
     for budget in budgets:
         if not recorder.sound:
             return
-        known, role = tried[:budget], Role.EXPLOIT_BY_SHARE
-        recorder.interact(exploiter, 1, role, history=known, start=start, method=method, budget=budget)
+        recorder.interact(exploiter, 1, role, history=tried[:budget], start=start, method=method, budget=budget)
 
 
 def _adapt(

@@ -54,6 +54,9 @@ class EvaluationConfig(StrictModel):
     exploit_share: float | None = Field(None, gt=0, le=1, exclude_if=lambda share: share is None)
     """Each method also acts from the start state at a point drawn from this share of the cloud, the best points; AIP
     draws its points in the same way. As published: 0.01. None: not done; documents leave it out."""
+    repeats: bool = Field(False, exclude_if=lambda repeats: not repeats)
+    """Each method with interactions also repeats one that succeeded, from the start state, or acts as by
+    `exploit_share` where none did (see `shared.policies.proposers.RepeatProposer`)."""
 
 
 class Setting(StrictModel):

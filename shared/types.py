@@ -109,6 +109,8 @@ class Role(StrEnum):
     """An interaction whose point was drawn from the best share of the cloud instead of being the best of all."""
     EXPLOIT_BY_SHARE = "exploit-by-share"
     """The final action in the start state, at a point drawn from the best share of the cloud."""
+    REPEAT_AT_START = "repeat-at-start"
+    """The final action in the start state, near an interaction that succeeded, and turned as that was."""
 
 
 @dataclass(frozen=True, slots=True, init=False)

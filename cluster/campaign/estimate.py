@@ -189,6 +189,8 @@ class _Costs:
             # Once more where they began, after tries of their own where these are drawn.
             chosen += sum(len(method.budgets(told.budgets)) for method in methods)
             trying += [method for method in methods if method.draws_tries]
+        if told.repeats:
+            chosen += sum(len(method.budgets(told.budgets)) for method in methods if method.tries)
         tries = [max(method.budgets(told.budgets)) if method.tries else 0 for method in trying]
         by_policy = chosen + sum(n for n, m in zip(tries, trying, strict=True) if m.tries not in (None, RANDOM))
         interactions = rollouts * (told.queries + sum(tries) + chosen)

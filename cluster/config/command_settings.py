@@ -105,6 +105,9 @@ class EvaluateSettings(WorkerSettings, ObjectSelection):
     exploit_share: float | None = Field(None, gt=0, le=1)
     """Each method also acts at a point drawn from this share of the cloud, the best points, and AIP draws its points in
     the same way; as published: 0.01. Adds the column "sample-success, best share"."""
+    repeats: bool = False
+    """Each method with interactions also repeats one that succeeded, as a robot does (`adapt`), from the start state.
+    Adds the column "from the start, repeated"."""
     policy_version: int | None = Field(None, ge=1)
     """Version of the run's policy; default: the last."""
     collection: CollectionConfig = CollectionConfig()

@@ -175,6 +175,7 @@ def _evaluate(
             budgets=tuple(sorted(set(settings.budgets))),
             queries=settings.queries,
             exploit_share=settings.exploit_share,
+            repeats=settings.repeats,
         ),
     )
     if out is None:

@@ -19,8 +19,8 @@ from pydantic import model_validator
 
 from cluster.evaluation.published import PUBLISHED_MEASURES, STANDS_BESIDE, published_figure
 from cluster.evaluation.tables import (
+    BESIDE,
     BEST_METHOD,
-    LIKE_FOR_LIKE,
     MEASURES,
     ORDER,
     RESULTS_FILE,
@@ -50,7 +50,7 @@ COLUMNS = (
     *("gap closed", "best F", "BCE", "AUC"),
 )
 """Of the table that people see."""
-_ALL_MEASURES = (*MEASURES, *LIKE_FOR_LIKE)
+_ALL_MEASURES = (*MEASURES, *BESIDE)
 _COUNTED = tuple(field.name for field in fields(ObjectCounts) if field.name != "object")
 _ALWAYS_COUNTED = frozenset(field.name for field in fields(ObjectCounts) if field.default is MISSING)
 
@@ -90,7 +90,7 @@ class PooledRow:
     Attributes:
         method: which method.
         budget: how many interactions.
-        shares: of each of `MEASURES` and `LIKE_FOR_LIKE`: the figure, and where its interval begins and ends.
+        shares: of each of `MEASURES` and `BESIDE`: the figure, and where its interval begins and ends.
         by_run: of each of these: the figure in each run.
         paper: of each of `PUBLISHED_MEASURES`: the paper's own figure, percent; None where it has none.
         gap_closed: the share of the gap in F-score between Where2Act and the oracle.
@@ -327,14 +327,16 @@ def _cells(row: PooledRow) -> list[str]:
 def _like_for_like(comparison: Comparison) -> list[str]:
     """A table of what was measured as in the paper, and an empty line; none where a run is of an older version."""
     rows = comparison.rows
-    measured = [name for name in LIKE_FOR_LIKE if not all(math.isnan(row.shares[name][0]) for row in rows)]
+    measured = [name for name in BESIDE if not all(math.isnan(row.shares[name][0]) for row in rows)]
     if not measured:
         return []
     head, cells = ["method", "tries"], [[markdown(row.method), str(row.budget)] for row in rows]
     for name in measured:
-        head += [LIKE_FOR_LIKE[name], "paper"]
+        head += [BESIDE[name], *(["paper"] if name in STANDS_BESIDE else [])]
         for row, of_row in zip(rows, cells, strict=True):
-            of_row += [_with_limits(row.shares[name]), _of_paper(row.paper[STANDS_BESIDE[name]])]
+            of_row.append(_with_limits(row.shares[name]))
+            if name in STANDS_BESIDE:
+                of_row.append(_of_paper(row.paper[STANDS_BESIDE[name]]))
     note = like_for_like_note(rows[0].averages["mix_base_rate"], comparison.exploit_share)
     return [f"Like for like with the paper. {note}", "", *markdown_table(head, cells), ""]
 

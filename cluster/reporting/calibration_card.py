@@ -75,8 +75,7 @@ def calibrated(
         StoreError: a store is damaged, or holds no label.
     """
     for store in stores:
-        if store.setting.task != policy.task:
-            raise UsageError(f"{store.where}: is of '{store.setting.task}', the policy for '{policy.task}'")
+        policy.require_task(store.setting.task, source, f"{store.where} is of")
     data: list[tuple[Dataset, list[int]]] = []
     objects: dict[str, ObjectRef] = {}
     labels, owners, left_out = [np.zeros(0, np.bool_)], [np.zeros(0, np.str_)], 0

@@ -91,8 +91,7 @@ def source_of_training(training: Path, store: Store, results: Path | None, origi
     """
     folder = trained_in(training)
     policy, seen = read_policy_folder(folder), objects_seen(folder)
-    if policy.task != store.setting.task:
-        raise UsageError(f"{training}: a policy for '{policy.task}', but the store is of '{store.setting.task}'")
+    policy.require_task(store.setting.task, str(training))
     refs = tuple(ref for ref in store.setting.objects if ref.content_hash in seen)
     return Source(
         policy=policy,

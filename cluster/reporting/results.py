@@ -8,8 +8,8 @@ from plotly.subplots import make_subplots
 
 from cluster.evaluation.published import STANDS_BESIDE, published, published_figure
 from cluster.evaluation.tables import (
+    BESIDE,
     BEST_METHOD,
-    LIKE_FOR_LIKE,
     MEASURES,
     ORDER,
     WITHOUT_TRIES,
@@ -134,8 +134,8 @@ def tiles(results: Results) -> tuple[Tile, ...]:
 
 def like_for_like(results: Results) -> tuple[Table, ...]:
     """The table of what was measured as in the paper; none for files that older versions wrote."""
-    found = {name for name in LIKE_FOR_LIKE for row in results.rows if row.value(name) is not None}
-    measured = {name: shown for name, shown in LIKE_FOR_LIKE.items() if name in found}
+    found = {name for name in BESIDE for row in results.rows if row.value(name) is not None}
+    measured = {name: shown for name, shown in BESIDE.items() if name in found}
     if not measured:
         return ()
     base_rate = next((row.mix_base_rate for row in results.rows), None)

@@ -12,7 +12,6 @@ from cluster.config.campaign_config import CampaignConfig
 from cluster.runs.run_folder import RunFolder
 from learner.stages.jobs import DONE_FILE, objects_seen
 from learner.stages.trainers import ORACLE_FILE
-from shared.errors import UsageError
 from shared.io.files import read_bounded, write_atomically
 from shared.policies.policy import MAX_WEIGHTS_BYTES, Policy
 
@@ -40,8 +39,7 @@ def warm_start(source: str, task: str, out: Path) -> None:
 def fit_to_start_from(source: str, task: str) -> Policy:
     """The policy at `source`; raises as `warm_start` does."""
     policy = load_policy(source)
-    if policy.task != task:
-        raise UsageError(f"start_from '{source}': a policy for '{policy.task}', but the run is of '{task}'")
+    policy.require_task(task, f"start_from '{source}'", "the run is of")
     policy.require("prior", "aap", "aip")
     return policy
 

@@ -34,7 +34,15 @@ NO_TRIES_METHOD = "aap-no-tries"
 ORACLE_METHOD = "oracle"
 """A critic that is told the hidden facts: the bound of what interactions can teach. It never acts."""
 
-SHARES = ("f_score", "sample_success", "start_success", "mix_f_score", "shifted_f_score", "share_success")
+SHARES = (
+    "f_score",
+    "sample_success",
+    "start_success",
+    "mix_f_score",
+    "shifted_f_score",
+    "share_success",
+    "repeat_success",
+)
 """Figures that follow from counts by object, so that they have intervals over objects and can be pooled."""
 
 
@@ -60,6 +68,8 @@ class ObjectCounts:
         shifted_hits: those that both hold of.
         share_trials: EXPLOIT_BY_SHARE rows; empty where the evaluation executes none.
         share_successes: those that succeeded.
+        repeat_trials: REPEAT_AT_START rows; likewise.
+        repeat_successes: those that succeeded.
     """
 
     object: tuple[str, ...]
@@ -78,6 +88,8 @@ class ObjectCounts:
     shifted_hits: tuple[float, ...] = ()
     share_trials: tuple[int, ...] = ()
     share_successes: tuple[int, ...] = ()
+    repeat_trials: tuple[int, ...] = ()
+    repeat_successes: tuple[int, ...] = ()
 
     def f_score(self) -> tuple[float, float, float]:
         """F1 = 2 hits / (claimed + true), and its 95% interval over objects; NaN where nothing is claimed or true."""
@@ -102,6 +114,10 @@ class ObjectCounts:
     def share_success(self) -> tuple[float, float, float]:
         """The share of EXPLOIT_BY_SHARE rows that succeeded, and its 95% interval over objects; NaN where none are."""
         return _ratio(self.share_successes, self.share_trials, self.share_trials)
+
+    def repeat_success(self) -> tuple[float, float, float]:
+        """The same of REPEAT_AT_START rows."""
+        return _ratio(self.repeat_successes, self.repeat_trials, self.repeat_trials)
 
     def shares(self) -> dict[str, float]:
         """All of these by name, and where their intervals begin and end."""
@@ -135,6 +151,7 @@ class EvaluationRow(BaseModel):
         mix_f_score: as `f_score`, on the published mix of rows (see `learner.evaluation.published_mix`).
         shifted_f_score: the same after logits are shifted by logit(`mix_base_rate`) - logit(`base_rate`).
         share_success: share of the EXPLOIT_BY_SHARE rows that succeeded.
+        repeat_success: share of the REPEAT_AT_START rows that succeeded.
         mix_base_rate: share of successes in the published mix of rows.
         counts: what these are of, by object.
         gap_closed: the share of the gap in F-score between Where2Act and the oracle.
@@ -170,6 +187,9 @@ class EvaluationRow(BaseModel):
     share_success: float | None = None
     share_success_low: float | None = None
     share_success_high: float | None = None
+    repeat_success: float | None = None
+    repeat_success_low: float | None = None
+    repeat_success_high: float | None = None
     mix_base_rate: float | None = None
     counts: ObjectCounts | None = None
     gap_closed: float | None = None
@@ -322,10 +342,15 @@ class _Judge:
         asked, true, success = self._asked, self._true, self._success
         chosen = self._exploits(Role.EXPLOIT, method, budget)
         at_start = chosen if method == PRIOR_METHOD else self._exploits(Role.EXPLOIT_AT_START, method, budget)
-        by_share = self._exploits(Role.EXPLOIT_BY_SHARE, method, budget)
-        executed = Role.EXPLOIT_BY_SHARE.value in self.dataset.rows.role
+        by_share, repeats = (
+            self._exploits(role, method, budget) if role.value in self.dataset.rows.role else None
+            for role in (Role.EXPLOIT_BY_SHARE, Role.REPEAT_AT_START)
+        )
 
-        def of_objects(rows: NDArray[np.int64]) -> tuple[int, ...]:
+        def of_objects(rows: NDArray[np.int64] | None, chosen: NDArray[np.bool_] | None = None) -> tuple[int, ...]:
+            if rows is None:
+                return ()
+            rows = rows if chosen is None else rows[chosen[rows]]
             return tuple(np.bincount(self._object_of[rows], minlength=len(self._names)).tolist())
 
         def published_rows(chosen: NDArray[np.bool_]) -> tuple[float, ...]:
@@ -339,16 +364,18 @@ class _Judge:
             claimed=of_objects(asked[claimed]),
             hits=of_objects(asked[claimed & true]),
             trials=of_objects(chosen),
-            successes=of_objects(chosen[success[chosen]]),
+            successes=of_objects(chosen, success),
             start_trials=of_objects(at_start),
-            start_successes=of_objects(at_start[success[at_start]]),
+            start_successes=of_objects(at_start, success),
             mix_true=published_rows(true),
             mix_claimed=published_rows(claimed),
             mix_hits=published_rows(claimed & true),
             shifted_claimed=published_rows(shifted),
             shifted_hits=published_rows(shifted & true),
-            share_trials=of_objects(by_share) if executed else (),
-            share_successes=of_objects(by_share[success[by_share]]) if executed else (),
+            share_trials=of_objects(by_share),
+            share_successes=of_objects(by_share, success),
+            repeat_trials=of_objects(repeats),
+            repeat_successes=of_objects(repeats, success),
         )
 
     def _context(self, index: Tensor, method: str, budget: int) -> Tensor:

@@ -322,8 +322,7 @@ def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Polic
         seed = torch_seed(config.seed, "learner.weights") % 2**32
         return Policy.untrained(task, config.network, seed).of_hand(gripper)
     policy = read_policy_folder(job.init)
-    if policy.task != task:
-        raise UsageError(f"{job.init}: a policy for '{policy.task}', but the store is of '{task}'; use one of its task")
+    policy.require_task(task, str(job.init))
     told, has = config.network, policy.config
     if job.stage == "prior" and (told.pinch_profile > has.pinch_profile or told.roll_symmetry > has.roll_symmetry):
         profile, symmetry = has.pinch_profile or told.pinch_profile, has.roll_symmetry or told.roll_symmetry

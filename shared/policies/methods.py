@@ -28,6 +28,8 @@ MethodName = Name
 BaselineName = Name
 CriticName = Name
 """Of whose beliefs count: where2act, aap, or a baseline."""
+REPEATING = "repeat-"
+"""Before the name of a critic: of the proposer that repeats what succeeded, by its beliefs."""
 ModuleName = Name
 """Of a network that a policy may hold: prior, aap, aip, or a baseline."""
 

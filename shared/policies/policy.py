@@ -190,6 +190,20 @@ class Policy:
                     f"this policy's {name} is not trained (trained: {known}); run `adaafford train {name}`"
                 )
 
+    def require_task(self, task: str, source: str, of: str = "the store is of") -> None:
+        """Check that the policy is for a task.
+
+        Args:
+            task: its name.
+            source: what the policy was read from, or the option that names it.
+            of: what is of the task, as a message begins to say it.
+
+        Raises:
+            UsageError: it is for another one.
+        """
+        if self.task != task:
+            raise UsageError(f"{source}: a policy for '{self.task}', but {of} '{task}'; name one of this task")
+
     def to_files(self, half: bool = False) -> dict[str, bytes]:
         """The policy as files: weights.safetensors and policy.json.
 

@@ -13,11 +13,15 @@ from torch import Tensor
 from shared.errors import UsageError
 from shared.policies.adaptation import Adapter, Proposals, movable_points, reachable_action
 from shared.policies.critics import best_action, critic_named, critic_names
-from shared.policies.methods import PROPOSERS, CriticName, ProposerKind
+from shared.policies.methods import PROPOSERS, REPEATING, CriticName, ProposerKind
 from shared.types import Action, Float32, Interaction, Observation, Proposer
 
 TOP_POINTS = 100
 """Points that an exploit is drawn from (AdaAfford, Evaluation Metrics)."""
+REPEAT_M = 0.12
+"""How far from a try that succeeded its repetition may be; the part has moved since, and the hand with it."""
+MOST_REACHED = 50
+"""Repetitions of which an arm is asked whether it reaches them."""
 STOP_THRESHOLD = 0.0
 """The paper says "e.g., 0.05", but the AIP score is a drop of a loss whose mean here is about 0.003, so that 0.05 would
 stop at once; 0 stops where no point promises any gain."""
@@ -109,6 +113,37 @@ class ExploitProposer:
         return best_action(self.critic, self.adapter, observation, candidates, choose, history, self.rng)
 
 
+class RepeatProposer:
+    """Repeats what succeeded, where a critic believes in it most: the final action on a robot.
+
+    Of all actions that are turned as a try that succeeded was, at the movable points within `REPEAT_M` of it, it takes
+    the one with the highest score. It cannot be the same point, since the part has moved. Where no try succeeded, or
+    the arm reaches none of these actions, it does as `ExploitProposer`, with the same arguments.
+
+    Addition: the paper draws the point of the final action from the best ones, whatever was tried.
+    """
+
+    def __init__(
+        self, adapter: Adapter, rng: np.random.Generator, critic: CriticName = "aap", share: float | None = None
+    ) -> None:
+        self.name = critic
+        self._exploit = ExploitProposer(adapter, rng, critic, share)
+
+    def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
+        """The action to execute; never None."""
+        candidates, actions = movable_points(observation), list[Action]()
+        places = observation.points[candidates].astype(np.float64)
+        for tried in (each.action for each in history if each.outcome.success):
+            near = candidates[np.linalg.norm(places - tried.point, axis=1) < REPEAT_M]
+            actions += [Action(int(k), observation.points[k].astype(np.float64), tried.rotation) for k in near]
+        if actions:
+            scores = self._exploit.critic.predict(observation, actions, history)
+            for action in (actions[int(k)] for k in np.argsort(-scores, kind="stable")[:MOST_REACHED]):
+                if observation.reach is None or observation.reach.trajectory(action) is not None:
+                    return action
+        return self._exploit.propose(observation, history)
+
+
 def points_of(share: float, observation: Observation) -> int:
     """How many points a share of a cloud is, at least one; of all points, because the published 100 are of 10,000.
 
@@ -137,7 +172,8 @@ def proposer_named(
     """The proposer called `name`.
 
     Args:
-        name: one of `shared.policies.methods.PROPOSERS`, or the name of a critic, for a proposer that exploits it.
+        name: one of `shared.policies.methods.PROPOSERS`; or the name of a critic, for a proposer that exploits it; or
+            `REPEATING` and that name, for one that repeats what succeeded.
         adapter: the policy; None if the proposer needs none.
         rng: of its random draws.
         budget: how many interactions it may propose.
@@ -153,7 +189,8 @@ def proposer_named(
         if share is not None and kind.draw is not None:
             return kind.draw(adapter, rng, budget, share)
         return kind.make(adapter, rng, budget)
-    if name in critic_names() and adapter is not None:
-        return ExploitProposer(adapter, rng, name, share)
+    critic = name.removeprefix(REPEATING)
+    if critic in critic_names() and adapter is not None:
+        return (ExploitProposer if critic == name else RepeatProposer)(adapter, rng, critic, share)
     known = ", ".join((*PROPOSERS.names(), *critic_names()))
     raise UsageError(f"no proposer is called '{name}'; allowed: {known}")

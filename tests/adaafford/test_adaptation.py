@@ -9,7 +9,7 @@ from shared.errors import UsageError
 from shared.networks.network_config import NetworkConfig
 from shared.policies.adaptation import Adapter, action_from_frame, frames_in_view, movable_points
 from shared.policies.policy import Policy
-from shared.policies.proposers import TOP_POINTS, AipProposer, ExploitProposer, points_of
+from shared.policies.proposers import REPEAT_M, TOP_POINTS, AipProposer, ExploitProposer, RepeatProposer, points_of
 from shared.types import Action, Interaction, Outcome, OutcomeKind, Proposer
 from tests.support.small_networks import TINY
 from tests.support.small_policies import history_of, observation_of, policy_of
@@ -25,10 +25,11 @@ def proposers(adapter: Adapter, seed: int) -> list[Proposer]:
         AipProposer(adapter, np.random.default_rng(seed), budget=4, threshold=-1.0),
         ExploitProposer(adapter, np.random.default_rng(seed)),
         ExploitProposer(adapter, np.random.default_rng(seed), "where2act"),
+        RepeatProposer(adapter, np.random.default_rng(seed)),
     ]
 
 
-@pytest.mark.parametrize("which", range(3))
+@pytest.mark.parametrize("which", range(4))
 @pytest.mark.parametrize("tries", [0, 3])
 def test_a_proposal_is_a_rotation_at_a_movable_point(adapter: Adapter, which: int, tries: int) -> None:
     observation = observation_of()
@@ -46,7 +47,7 @@ def test_a_proposal_is_a_rotation_at_a_movable_point(adapter: Adapter, which: in
 
 
 def test_names_are_those_that_rows_hold(adapter: Adapter) -> None:
-    assert [proposer.name for proposer in proposers(adapter, 0)] == ["aip", "aap", "where2act"]
+    assert [proposer.name for proposer in proposers(adapter, 0)] == ["aip", "aap", "where2act", "aap"]
 
 
 def test_aip_stops_on_its_budget_and_below_its_threshold(adapter: Adapter) -> None:
@@ -96,6 +97,46 @@ def test_a_share_draws_points_from_the_best_of_the_whole_cloud(adapter: Adapter,
         drawn = {action.point_index for _ in range(6) if (action := proposer.propose(observation, [])) is not None}
         assert drawn <= best
         assert len(drawn) > 1 or count == 1
+
+
+def test_a_final_action_repeats_what_succeeded_near_it_where_the_critic_believes_in_it_most(adapter: Adapter) -> None:
+    observation = observation_of(points=600)
+    failed, other, best = history_of(observation, 3)
+    failed, other, best = (
+        dataclasses.replace(tried, outcome=Outcome(OutcomeKind.OK, 0.1 * success, success))
+        for tried, success in ((failed, False), (other, True), (best, True))
+    )
+    history = [failed, other, best]
+    action = RepeatProposer(adapter, np.random.default_rng(0)).propose(observation, history)
+    assert action is not None
+    expected = {
+        (int(point), k): adapter.score(
+            observation, [dataclasses.replace(tried.action, point_index=int(point))], history
+        )
+        for k, tried in enumerate((other, best))
+        for point in movable_points(observation)
+        if np.linalg.norm(observation.points[point] - tried.action.point) < REPEAT_M
+    }
+    point, which = max(expected, key=lambda key: float(expected[key][0]))
+    assert action.point_index == point
+    assert np.array_equal(action.rotation, (other, best)[which].action.rotation)
+
+
+def test_where_nothing_succeeded_or_is_in_reach_a_final_action_is_an_exploit(adapter: Adapter) -> None:
+    observation = observation_of(points=600)
+    (tried,) = history_of(observation, 1)
+    failed = dataclasses.replace(tried, outcome=Outcome(OutcomeKind.OK, 0.0, False))
+    succeeded = dataclasses.replace(tried, outcome=Outcome(OutcomeKind.OK, 0.1, True))
+    far = dataclasses.replace(succeeded, action=dataclasses.replace(succeeded.action, point=np.full(3, 9.0)))
+    for history in ([], [failed], [far]):
+        mine, exploit = (
+            kind(adapter, np.random.default_rng(3), share=0.01).propose(observation, history)
+            for kind in (RepeatProposer, ExploitProposer)
+        )
+        assert mine is not None
+        assert exploit is not None
+        assert mine.point_index == exploit.point_index
+        assert np.array_equal(mine.rotation, exploit.rotation)
 
 
 def test_a_share_of_a_published_cloud_is_the_published_number_of_points() -> None:

@@ -279,7 +279,7 @@ def test_lines_go_between_session_and_robot(
         (["--seed", "-1"], "not negative"),
         (["--goal", "0.5"], "needs --policy"),
         (["--policy", "push-faucet", "--goal", "-1"], "more than 0"),
-        (["--policy", "push-faucet"], "is for 'push-faucet', but --task is 'pull-closed-door'"),
+        (["--policy", "push-faucet"], "a policy for 'push-faucet', but --task is 'pull-closed-door'"),
         (["--repeat"], "give one"),
         (["--budget", "6"], "allowed are 7"),
         (["--task", "juggle"], "juggle"),

@@ -82,6 +82,7 @@ def test_a_share_costs_an_action_at_each_budget_and_aip_its_tries_again() -> Non
 
     trials = CampaignConfig().rollouts.evaluation
     assert evaluated(exploit_share=0.01) - evaluated() == trials * (3 * 2 + 4)
+    assert evaluated(repeats=True) - evaluated() == trials * 2 * 2
 
 
 def test_rates_are_of_their_stages_alone() -> None:

@@ -88,6 +88,7 @@ def table_of(**values: object) -> EvaluationTable:
         **{"mix_f_score": 0.8, "mix_f_score_low": 0.7, "mix_f_score_high": 0.9, "mix_base_rate": 0.45},
         **{"shifted_f_score": None, "shifted_f_score_low": None, "shifted_f_score_high": None},
         **{"share_success": None, "share_success_low": None, "share_success_high": None},
+        **{"repeat_success": None, "repeat_success_low": None, "repeat_success_high": None},
     }
     share = 0.01 if "share_success" in values else None
     return EvaluationTable(
@@ -103,6 +104,7 @@ def test_tables_show_intervals_and_what_there_is_no_figure_of() -> None:
     both = as_markdown(table_of(share_success=0.25, share_success_low=0.1, share_success_high=0.5))
     assert "| 80.0 [70.0, 90.0] | 25.0 [10.0, 50.0] |\n" in both
     assert "drawn from the best 1% of the cloud" in both
+    assert "| from the start, repeated |" in as_markdown(table_of(repeat_success=0.25))
     assert "30.0% succeed" in shown
     assert "of which 45.0% succeed (a critic that always says yes has an F-score of 62.1)" in shown
     read = list(csv.DictReader(io.StringIO(csv_table([row.model_dump() for row in table_of().rows], ["counts"]))))

@@ -80,7 +80,7 @@ def test_bad_arguments_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "is no scan" in bad([store, "--out", "marks.npz"], capsys)
     assert "no such folder" in bad([store, "--objects", str(tmp_path / "absent")], capsys)
     assert "no policy" in bad([store, "--policy", "nobody"], capsys)
-    other = "--policy pull: is for 'pull', but the store is of 'push'; name one of this task"
+    other = "--policy pull: a policy for 'pull', but the store is of 'push'; name one of this task"
     assert other in bad([store, "--policy", "pull"], capsys)
     assert "at most 2" in bad([store, "--policy", "a", "b", "c"], capsys)
     assert "allowed are 0 to 65535" in bad([store, "--port", "70000"], capsys)

@@ -259,6 +259,23 @@ def test_evaluation_by_share_comes_last_and_leaves_all_other_rows_as_they_are(ob
     assert all(np.array_equal(row.joint_positions, start) for row in more if row.role is exploit)
 
 
+@pytest.mark.usefixtures("fake")
+def test_repeats_come_last_at_the_start_and_are_of_methods_with_interactions(objects: Path) -> None:
+    told = EvaluationConfig(methods=("where2act", "ours-random"), budgets=(1, 2), queries=3, exploit_share=0.01)
+    with_repeats = told.model_copy(update={"repeats": True})
+    before, after = (
+        rollout(plan_for(objects, kind="evaluation", evaluation=each, collection=FAKE), objects)
+        for each in (told, with_repeats)
+    )
+    more = after.interactions[len(before.interactions) :]
+    assert [(row.method, row.role, row.budget) for row in more] == [
+        ("ours-random", Role.REPEAT_AT_START, budget) for budget in (1, 2)
+    ]
+    start = before.interactions[0].joint_positions
+    assert all(np.array_equal(row.joint_positions, start) for row in more)
+    assert "repeats" not in told.model_dump_json()
+
+
 def test_a_setting_without_a_share_is_the_document_that_it_was() -> None:
     assert "exploit_share" not in EvaluationConfig().model_dump_json()
     told = EvaluationConfig(exploit_share=0.01)

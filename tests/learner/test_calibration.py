@@ -178,7 +178,7 @@ def test_what_cannot_be_calibrated_is_refused_in_one_line(
     for name in (WEIGHTS_FILE, POLICY_FILE):
         (tmp_path / "lone" / name).write_bytes(Policy.untrained("push", policy_of().config, 0).to_files()[name])
     for given, expected in (
-        (["--policy", "pull-closed-door", *where], "the policy for 'pull-closed-door'"),
+        (["--policy", "pull-closed-door", *where], "a policy for 'pull-closed-door', but"),
         ([*own, "--store", str(tmp_path / "gone"), *where[2:]], "gone"),
         ([*own, *where[:2], "--out", str(tmp_path / "full")], "holds something that is not an exported policy"),
         (["--policy", str(tmp_path / "lone"), *where], "prior is not trained"),

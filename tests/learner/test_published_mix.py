@@ -133,16 +133,16 @@ def scores_of(store: Store) -> np.ndarray:
     return np.concatenate([critic(index, index[:0]).numpy() for index in dataset.rollouts])
 
 
-def test_table_counts_exploits_by_share_apart_from_all_others(tmp_path: Path) -> None:
-    """Of one rollout in three rows: a query, an exploit, and one by share."""
+def test_table_counts_exploits_by_share_and_repeats_apart_from_all_others(tmp_path: Path) -> None:
+    """Of one rollout in four rows: a query, an exploit, one by share, and a repeat."""
     setting = fabricate_setting(points=64)
     plan = Plan(setting=setting, proposer="evaluation", policy_version=1)
-    roles, rollouts = (Role.QUERY, Role.EXPLOIT, Role.EXPLOIT_BY_SHARE), []
-    for record in fabricate_rollouts(plan, Job(plan.key, 0, 6), interactions=3):
+    roles, rollouts = (Role.QUERY, Role.EXPLOIT, Role.EXPLOIT_BY_SHARE, Role.REPEAT_AT_START), []
+    for record in fabricate_rollouts(plan, Job(plan.key, 0, 6), interactions=4):
         pairs = zip(record.interactions, roles, strict=True)
         rows = [replace(row, role=role, method="" if role is Role.QUERY else PRIOR_METHOD) for row, role in pairs]
         rollouts.append(replace(record, interactions=tuple(rows)))
-    for name, kept in (("both", 3), ("natural", 2)):
+    for name, kept in (("all", 4), ("natural", 2)):
         store = Store.create(tmp_path / name, setting)
         own = [replace(record, interactions=record.interactions[:kept]) for record in rollouts]
         store.commit(plan, Job(plan.key, 0, 6), own, {})
@@ -150,12 +150,13 @@ def test_table_counts_exploits_by_share_apart_from_all_others(tmp_path: Path) ->
         prior = evaluate_store(store, 1, (1,))[0]
         success = [[row.outcome.success for row in record.interactions] for record in own]
         assert prior.sample_success == pytest.approx(np.mean([row[1] for row in success]))
-        if name == "both":
+        if name == "all":
             assert prior.share_success == pytest.approx(np.mean([row[2] for row in success]))
-            assert sum(prior.counts.share_trials) == 6
+            assert prior.repeat_success == pytest.approx(np.mean([row[3] for row in success]))
+            assert sum(prior.counts.share_trials) == sum(prior.counts.repeat_trials) == 6
         else:
-            assert prior.share_success is None
-            assert prior.counts.share_trials == ()
+            assert prior.share_success is prior.repeat_success is None
+            assert prior.counts.share_trials == prior.counts.repeat_trials == ()
 
 
 def test_table_without_any_success_has_no_figure_of_the_published_mix(tmp_path: Path) -> None:

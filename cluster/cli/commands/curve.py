@@ -98,8 +98,12 @@ def _judge(command: CurveCommand, runs: dict[str, list[Path]]) -> "Curves":
     trained = {name: [trained_in(folder) for folder in folders] for name, folders in runs.items()}
     policies = {name: [read_policy_folder(folder) for folder in all_] for name, all_ in trained.items()}
     store = Store.open(command.store)
+    for name, of_name in policies.items():
+        for folder, policy in zip(runs[name], of_name, strict=True):
+            policy.require_task(store.setting.task, str(folder))
+            policy.require("prior", "aap")
     every = [policy for found in policies.values() for policy in found]
-    _check(every, store.setting.task)
+    _check_alike(every)
     seen = frozenset().union(*(objects_seen(folder) for all_ in trained.values() for folder in all_))
     new = {ref.id for ref in store.setting.objects if ref.content_hash not in seen}
     dataset = load_dataset(store, every[0].config)
@@ -134,21 +138,17 @@ def _judge(command: CurveCommand, runs: dict[str, list[Path]]) -> "Curves":
     )
 
 
-def _check(policies: "list[Policy]", task: str) -> None:
-    """Refuse policies that cannot be asked about rows of a task.
+def _check_alike(policies: "list[Policy]") -> None:
+    """Refuse policies whose networks look at other neighbours of a point.
 
     Raises:
-        UsageError: another task, or networks that look at other neighbours of a point.
+        UsageError: they do.
     """
     seen_alike = {(p.config.centres, p.config.radii, p.config.neighbours) for p in policies}
     if len(seen_alike) > 1:
         raise UsageError(
             "the runs' networks differ in centres, radii or neighbours; judge them by commands of their own"
         )
-    for policy in policies:
-        if policy.task != task:
-            raise UsageError(f"a policy for '{policy.task}', but the store is of '{task}'; use one of its task")
-        policy.require("prior", "aap")
 
 
 def _answers(

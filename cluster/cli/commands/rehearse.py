@@ -99,10 +99,7 @@ def main(args: list[str]) -> int:
     from shared.tasks import task_of
 
     policy, task = load_policy(command.policy), task_of(command.task)
-    if policy.task != task.name:
-        raise UsageError(
-            f"--policy {command.policy}: is for '{policy.task}', but --task is '{task.name}'; name one of this task"
-        )
+    policy.require_task(task.name, f"--policy {command.policy}", "--task is")
     ended = [_played(command, robot, policy) for robot in _robots(command, policy.gripper)]
     print(_summary(command, ended))
     return 0

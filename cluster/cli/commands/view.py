@@ -147,11 +147,7 @@ def _store_page(command: ViewCommand) -> "Callable[[viser.ViserServer], object]"
     published = known.policy_versions()
     loaded = {name: load_policy(name) for name in dict.fromkeys(command.policy)}
     for name, policy in loaded.items():
-        if policy.task != known.setting.task:
-            raise UsageError(
-                f"--policy {name}: is for '{policy.task}', but the store is of '{known.setting.task}'; "
-                "name one of this task"
-            )
+        policy.require_task(known.setting.task, f"--policy {name}")
     given = {plain(name): partial(lambda policy: policy, policy) for name, policy in loaded.items()}
     policies = given | {f"version {each}": partial(_published, known, each) for each in published}
     newest = [f"version {each}" for each in published[-1:]]
