@@ -43,6 +43,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason=reason))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_waiting_for_the_disk() -> Iterator[None]:
+    """No test cuts the power, and those of what is synced, and in which order, wrap or replace this once more."""
+
+    def sync(descriptor: int) -> None:
+        os.fstat(descriptor)  # As the real one, it fails where nothing is open.
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", sync)
+        yield
+
+
 @pytest.fixture(scope="session")
 def real_objects() -> Path:
     """Folder of real objects, which tests must never write to."""

@@ -327,6 +327,7 @@ def test_a_session_keeps_the_scan_of_a_recording_as_a_file(tmp_path: Path, monke
         Session(policy_of(), files, points=128, lens=Lens(intrinsics=LENS)).step(recording)
 
 
+@pytest.mark.slow
 def test_what_is_no_recording_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = ROS.write(tmp_path / "drive", [("/points", 0, ROS.cloud(points()))]) / "drive.mcap"
     (tmp_path / "cut.mcap").write_bytes(whole.read_bytes()[:60])

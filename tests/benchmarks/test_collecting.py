@@ -185,6 +185,7 @@ def test_collect_times_what_users_run(capsys: pytest.CaptureFixture[str], object
     assert {"date", "hardware", "software"} <= kept[0].keys()
 
 
+@pytest.mark.slow
 def test_the_published_protocol_executes_some_of_the_stored_trials(
     capsys: pytest.CaptureFixture[str], objects: Path
 ) -> None:

@@ -71,6 +71,7 @@ def test_furthest_points_cover_the_cloud_and_a_ball_holds_what_is_near() -> None
         assert distances.max() <= 0.2 + 1e-5
 
 
+@pytest.mark.slow
 def test_the_port_has_the_published_network_and_learns() -> None:
     config = NETWORKS["published"]
     ours = sum(p.numel() for name, p in PointNet2(config).named_parameters() if "from_feature" not in name)

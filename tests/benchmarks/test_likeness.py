@@ -27,6 +27,7 @@ def test_profiles_of_one_kind_cannot_be_told_apart_and_others_can(monkeypatch: p
     assert nearest_ratio(real, OBJECTS, drawn(1, 2.0)) > 1.5
 
 
+@pytest.mark.slow
 def test_the_benchmark_compares_two_folders(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

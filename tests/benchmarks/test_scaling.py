@@ -66,6 +66,7 @@ def test_actors_with_a_process_lift_the_prediction() -> None:
     assert predictions(worker_groups, stores, WISH)["driver_ms_by_job_s"]["at_zero"] == pytest.approx(0.9 + 1.0)
 
 
+@pytest.mark.slow
 def test_a_made_up_store_is_listed_as_a_real_one_and_takes_further_shards(template: Store, tmp_path: Path) -> None:
     turns = []
     benchmark = ListingBenchmark(template, tmp_path / "large", [3, 40])

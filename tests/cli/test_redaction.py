@@ -67,6 +67,7 @@ def test_an_address_of_a_cluster_holds_no_secret() -> None:
     assert TypeAdapter(RayAddress).validate_python("ray://host:1") == "ray://host:1"
 
 
+@pytest.mark.slow
 def test_a_bucket_out_of_reach_is_told_without_the_secrets_of_its_address() -> None:
     environment = {name: value for name, value in os.environ.items() if not name.startswith("AWS_")}
     environment |= {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": SECRET, "AWS_REGION": "us-east-1"}

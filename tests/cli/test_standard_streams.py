@@ -163,6 +163,7 @@ def test_a_reader_that_has_enough_ends_every_command_that_only_prints_without_a_
             assert (each.returncode, each.stderr) == (128 + signal.SIGPIPE, b""), args
 
 
+@pytest.mark.slow
 def test_what_goes_into_out_is_written_although_nobody_reads_the_output(folder: Path) -> None:
     done = without_reader(folder, ["store", "merge", "STORE", "--out", "MERGED"], unbuffered=True)
     assert done.returncode == 1

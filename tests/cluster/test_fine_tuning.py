@@ -75,6 +75,7 @@ def test_a_policy_does_not_say_what_its_predecessor_has_seen(name: str) -> None:
     assert not seen_by(name) & seen_by(f"{name}-sparse")
 
 
+@pytest.mark.slow
 def test_a_run_that_started_from_a_policy_is_not_evaluated_on_what_that_has_seen(
     source: RunFolder, tmp_path: Path
 ) -> None:

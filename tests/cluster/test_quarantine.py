@@ -340,6 +340,7 @@ def test_a_broken_environment_ends_the_collection_on_ray(tmp_path: Path, mishap:
     assert all(not shard.quarantined for shard in store.committed())
 
 
+@pytest.mark.slow
 def test_a_replayed_rollout_crashes_before_ones_eyes(tmp_path: Path) -> None:
     store = new_store(tmp_path)
     fill(store, {5: "raise"})

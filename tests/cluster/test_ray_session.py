@@ -123,6 +123,7 @@ def listened_at() -> set[str]:
     return {each.laddr.ip for each in connections if each.status == psutil.CONN_LISTEN}
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_a_private_session_is_private_whatever_the_environment_says(scratch: Path) -> None:
     """Of other sessions, and of a user who has neither a name nor a home."""
@@ -354,6 +355,7 @@ def test_a_session_that_does_not_come_up_is_said_in_a_line(monkeypatch: pytest.M
     assert len(set(tried)) == session.START_ATTEMPTS
 
 
+@pytest.mark.slow
 def test_a_session_that_does_not_come_up_at_first_is_started_again_and_leaves_no_process(
     sessions: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -510,6 +512,7 @@ def test_only_the_raylets_programs_are_replaced(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_ray_process_in_place_of_an_agent_ends_with_its_raylet() -> None:
     """A shell stands for the raylet here, and is killed."""
     program = f"export RAY_RAYLET_PID=$$; '{sys.executable}' '{RAY_PROCESS}' /ray/dashboard/agent.py & echo $!; wait"

@@ -216,6 +216,7 @@ def test_a_rollout_that_crashes_costs_itself_alone(
     assert crash_log.sweep() == 0, "processes that crashed have left something"
 
 
+@pytest.mark.slow
 def test_a_rollout_that_hangs_is_ended_with_a_traceback(ray_worker_group: WorkerGroup, tmp_path: Path) -> None:
     (tmp_path / "hang-0").write_text("1")
     with warnings_of("cluster.workers.retries") as lines:
@@ -224,6 +225,7 @@ def test_a_rollout_that_hangs_is_ended_with_a_traceback(ray_worker_group: Worker
     assert re.search(r"in rollout 0 \(took more than 0:00:02, in _misbehave \(fake_worker.py:\d+\)", lines[0])
 
 
+@pytest.mark.slow
 def test_memory_that_explodes_is_bounded(ray_worker_group: WorkerGroup, tmp_path: Path) -> None:
     (tmp_path / "explode-1").write_text("1")
     with warnings_of("cluster.workers.retries") as lines:
@@ -263,6 +265,7 @@ def test_a_rollout_whose_process_is_always_killed_is_quarantined_at_last(
     assert "killed from outside, or out of memory" in (tmp_path / "quarantined-1").read_text()
 
 
+@pytest.mark.slow
 def test_processes_killed_at_random_are_no_rollouts_fault(
     ray_worker_group: WorkerGroup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -72,6 +72,7 @@ def test_a_trial_that_a_contact_ends_is_recorded_to_that_contact() -> None:
     assert caption(take.primitive, take.outcome) == "push: start-collision, failure, m = 0.000"
 
 
+@pytest.mark.slow
 def test_a_film_is_written_with_a_caption_a_primitive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film, "ENOUGH", 1)
     out = tmp_path / "made/film.png"

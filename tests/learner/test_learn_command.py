@@ -138,6 +138,7 @@ def test_a_policy_is_published_once_under_the_next_free_version(tmp_path: Path) 
         publish(store, tmp_path, "a", tmp_path / "a")
 
 
+@pytest.mark.slow
 def test_the_command_learns_from_a_finished_store_in_a_bucket_and_publishes_the_best(
     s3_url: str, tmp_path: Path
 ) -> None:

@@ -106,6 +106,7 @@ def learners() -> list[psutil.Process]:
     return [child for child in living if "cluster.cli.child" in child.cmdline()]
 
 
+@pytest.mark.slow
 def test_a_learner_goes_on_from_stage_to_stage_in_one_process(store: Path, tmp_path: Path) -> None:
     lines: list[str] = []
 
@@ -374,6 +375,7 @@ def test_a_whole_run_as_a_start_is_answered_with_a_stage_of_it(
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_every_stage_learns_in_bf16(store: Path, tmp_path: Path) -> None:
     before: Path | None = None
     for stage in ("prior", "aap", "aip"):

@@ -69,6 +69,7 @@ def test_furthest_points_that_are_equally_far_come_in_the_order_of_stored_data(
     assert hashlib.sha256(chosen.astype("<i8").tobytes()).hexdigest()[:16] == digest
 
 
+@pytest.mark.slow
 def test_compiled_code_is_kept_in_the_cache_of_the_user_and_nowhere_without_a_home(tmp_path: Path) -> None:
     """Of a small function, since ours take seconds to compile."""
     here, cache, temporary = tmp_path / "here", tmp_path / "cache", Path(tempfile.mkdtemp(prefix="t", dir="/tmp"))

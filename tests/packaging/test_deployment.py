@@ -229,6 +229,7 @@ def s3_with_keys(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
             process.terminate()
 
 
+@pytest.mark.slow
 def test_the_rights_of_our_key_are_enough_for_a_store_and_for_nothing_else(
     s3_with_keys: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

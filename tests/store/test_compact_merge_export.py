@@ -230,6 +230,7 @@ def test_the_commands_say_what_they_did(tmp_path: Path, capsys: pytest.CaptureFi
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_benchmark_reads_what_was_committed(tmp_path: Path) -> None:
     store = make(tmp_path / "store", (0, 1), (1, 4))
     benchmark, turns = StoringBenchmark(store, repeats=2, bucket=True), []

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from shared.io.files import temporary_name
 from shared.plan import Job, Plan, missing_jobs
 from shared.store import Store, verify
@@ -20,6 +22,7 @@ def run(task: str, path: Path) -> int:
     return int(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_writer_killed_at_any_step_leaves_a_store_that_finishes_with_the_same_digest(tmp_path: Path) -> None:
     steps = run("kill-commits", tmp_path / "killed")
     assert steps > 40, "every file is opened and forced to the disk, so there are many steps"
@@ -45,6 +48,7 @@ def test_a_creator_killed_at_any_step_leaves_a_folder_that_can_become_the_store(
     assert run("kill-creations", tmp_path) > 5
 
 
+@pytest.mark.slow
 def test_several_processes_create_and_commit_the_same_at_once(tmp_path: Path) -> None:
     assert run("race", tmp_path / "store") == 0
     store = Store.open(tmp_path / "store")

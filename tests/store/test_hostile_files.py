@@ -11,7 +11,7 @@ import pytest
 from tests.support.hostile_runs import assert_harmless
 
 MUTANTS = {"store": 8000, "policy": 4000, "run": 8000}
-SAMPLE, SOME, BATCH = 15, {"store": 200, "policy": 300, "run": 750}, 1000
+SAMPLE, SOME, BATCH = 6, {"store": 200, "policy": 300, "run": 750}, 1000
 
 
 def test_a_sample_of_hostile_files_is_refused_or_harmless(tmp_path: Path) -> None:

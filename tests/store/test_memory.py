@@ -41,6 +41,7 @@ COMMANDS: dict[str, Callable[[Store, Path], object]] = {
     },
     "compact": lambda store, _: compact(store, 4, tidy),
 }
+LONGER = {name for name in COMMANDS if name.startswith("export as ")} | {"compact"}
 
 
 @pytest.fixture
@@ -61,7 +62,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
 
 @pytest.mark.timeout(600)
 @pytest.mark.usefixtures("little_garbage")
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in LONGER else []) for name in COMMANDS]
+)
 def test_memory_hardly_grows_with_the_number_of_shards(
     name: str, made: dict[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -109,6 +109,7 @@ def test_of_a_holder_on_another_machine_the_user_decides(tmp_path: Path, monkeyp
         pass
 
 
+@pytest.mark.slow
 def test_of_many_who_find_a_dead_holder_one_at_a_time_takes_over(tmp_path: Path) -> None:
     path, count = tmp_path / "lock", tmp_path / "count"
     end(holder(path, "no locks"))

@@ -98,6 +98,7 @@ def test_what_somebody_else_has_put_there_is_not_used(kind: str, own: Path, tmp_
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @as_root
 def test_a_second_user_reads_and_replaces_nothing(own: Path) -> None:
     crash_log = CrashLog(None, BUCKET)

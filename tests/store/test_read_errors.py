@@ -149,6 +149,7 @@ def test_an_error_in_reading_ends_the_command_and_harms_nothing(name: str, tmp_p
     assert ended > injected // 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["verify", "repair", "compact", "learn"])
 def test_an_error_of_a_bucket_ends_the_command_and_harms_nothing(name: str, s3_url: str, tmp_path: Path) -> None:
     _, ended = disturb_all(name, places_of(s3_url), BUCKET_READ_FAULTS, tmp_path / "out", most=3)

@@ -207,6 +207,7 @@ def test_batches_of_workers_come_in_the_order_in_which_they_would_have(
     assert taken.isdisjoint(shares[0] + shares[1])
 
 
+@pytest.mark.slow
 def test_what_comes_later_is_not_read_and_a_rewritten_store_is_refused(tmp_path: Path) -> None:
     store = make_store(tmp_path / "store")
     dataset = dataset_of(store)

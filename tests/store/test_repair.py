@@ -104,6 +104,7 @@ def ruin_many(original: Path, folder: Path, cases: int, seed: int) -> None:
     print(f"{cases} damaged stores, {changed} with changed data: all found, all repaired")
 
 
+@pytest.mark.slow
 def test_random_damage_is_found_and_repaired(original: Path, tmp_path: Path) -> None:
     ruin_many(original, tmp_path, 10, seed=1)
 
@@ -157,6 +158,7 @@ def test_nothing_is_repaired_where_nothing_tells_the_setting(tmp_path: Path) -> 
     assert (tmp_path / "store.json").read_bytes() == b"x"
 
 
+@pytest.mark.slow
 def test_a_bucket_is_repaired_too(s3_url: str) -> None:
     store = Store.create(s3_url, SETTING)
     fill(store)

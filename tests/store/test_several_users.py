@@ -53,6 +53,7 @@ def upkeep(store: Store, tmp_path: Path) -> list[Any]:
     ]
 
 
+@pytest.mark.slow
 def test_nobody_repairs_compacts_or_merges_beside_a_driver(where: str, tmp_path: Path) -> None:
     store = make(where)
     before = store.backend.leaves("shards")
@@ -254,6 +255,7 @@ def shared_folder() -> Iterator[Path]:
     shutil.rmtree(path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may become other users")
 def test_users_of_one_group_share_a_store(shared_folder: Path, tmp_path: Path) -> None:
     group, users = 54321, (54322, 54323)

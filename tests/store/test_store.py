@@ -69,6 +69,7 @@ FINITE = st.floats(allow_nan=False, allow_infinity=False)
 TEXT = st.text(st.characters(blacklist_categories=["C", "Z"]), max_size=20)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_numbers_and_texts_survive(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
@@ -109,6 +110,7 @@ def digest_of_twelve(tmp_path_factory: pytest.TempPathFactory) -> str:
     return make(tmp_path_factory.mktemp("whole"), (0, 12)).digest()
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(cuts=st.sets(st.integers(1, 11)), order=st.randoms())
 def test_the_digest_does_not_depend_on_grouping_or_order(
@@ -382,6 +384,7 @@ def test_a_shard_opens_in_plain_zarr_and_parquet(tmp_path: Path) -> None:
     assert motions == [one.outcome.motion for rollout in rollouts for one in rollout.interactions]
 
 
+@pytest.mark.slow
 def test_reading_leaves_no_thread_that_could_outlive_python(tmp_path: Path) -> None:
     # One of Arrow's that drops the last reference to our bytes while Python ends takes the process down (SIGABRT).
     make(tmp_path / "store", (0, 2))

@@ -97,9 +97,11 @@ def test_an_error_at_some_steps_on_a_disk_does_no_harm(tmp_path: Path, undisturb
     disturb_all(lambda name: str(tmp_path / name), disk_faults, "ENOSPC", undisturbed, every=7)
 
 
+@pytest.mark.slow
 def test_an_error_at_some_steps_in_a_bucket_does_no_harm(s3_url: str, undisturbed: str) -> None:
     disturb_all(lambda name: f"{s3_url}/{name}", bucket_faults, "answer lost", undisturbed, every=6)
 
 
+@pytest.mark.slow
 def test_a_kill_after_any_step_in_a_bucket_does_no_harm(s3_url: str) -> None:
     kill_at_all(s3_url, "kill after")
