@@ -20,7 +20,7 @@ from shared.io.files import read_bounded
 from shared.policies.policy import MAX_WEIGHTS_BYTES, WEIGHTS_FILE
 from shared.segmentation.scenes import MOVABLE, Kind
 from shared.segmentation.segmenter import MAX_DOCUMENT_BYTES, SEGMENTATION_FILE, Part, Segmentation, Segmenter
-from shared.tasks import TASKS
+from shared.tasks import Task
 from shared.types import Float, Float32
 
 SEGMENTATION = "segmentation"
@@ -158,14 +158,13 @@ class PartFinder:
     """Finds the parts of raw scans that a task acts on.
 
     Args:
-        task: by name; for one that acts on turning parts alone, the confidence of a part is that it turns.
+        task: for one that acts on turning parts alone, the confidence of a part is that it turns; None: not known.
         segmenter: the network; the bundled one unless given.
     """
 
-    def __init__(self, task: str, segmenter: Segmenter | None = None) -> None:
+    def __init__(self, task: Task | None, segmenter: Segmenter | None = None) -> None:
         self._segmenter = segmenter or bundled_segmenter()
-        turning_only = task in TASKS.names() and TASKS.get(task).revolute_only
-        self._kinds = (Kind.TURNING,) if turning_only else MOVABLE
+        self._kinds = (Kind.TURNING,) if task is not None and task.revolute_only else MOVABLE
         self._last: tuple[Scan, Segmentation, tuple[Part, ...]] | None = None
 
     def cut_out(

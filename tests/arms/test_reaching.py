@@ -40,7 +40,7 @@ from shared.store.codecs.tables import read_table, table_bytes
 from shared.store.layout import ARM_VERSION
 from shared.store.validity import check_rollouts
 from shared.store.writer import rollout_digest
-from shared.tasks import task_named
+from shared.tasks import Task, task_named
 from shared.types import Action, HiddenDynamics, Observation, OutcomeKind
 from tests.adaafford.test_adapt_command import front
 from tests.collector.test_determinism import ROLLOUTS, collected
@@ -252,6 +252,14 @@ def test_a_step_gives_the_trajectory_of_its_action(tmp_path: Path, up: tuple[flo
     assert (path >= chain_of(PANDA).lower).all() and (path <= chain_of(PANDA).upper).all()
     heat = np.load(tmp_path / "heatmap.npz")
     assert heat["reachable"].shape == heat["affordance"].shape and heat["reachable"].any()
+
+
+def test_an_arm_needs_a_task_that_is_known(tmp_path: Path) -> None:
+    policy, files = policy_with_all(), SessionFiles(tmp_path / "history.json", None)
+    policy.task = "push-slowly"
+    with pytest.raises(UsageError, match="in the policy's task 'push-slowly' is not known here"):
+        Session(policy, files, arm=PANDA)
+    Session(policy.defined_as(Task(name="push-slowly", primitive="push")), files, arm=PANDA)
 
 
 def test_an_arm_that_reaches_nothing_is_said_and_nothing_is_written(tmp_path: Path) -> None:
