@@ -55,6 +55,10 @@ SURFACE_POINTS = 10_000
 """Of a scan, about, that the links of an arm must not touch."""
 
 
+class ReachError(UsageError):
+    """The arm reaches none of the actions that are proposed for a scan."""
+
+
 @dataclass(frozen=True, slots=True)
 class SessionFiles:
     """What a session reads and writes.
@@ -320,14 +324,14 @@ class Session:
         """How the arm executes an action.
 
         Raises:
-            UsageError: it reaches neither this nor any other action that was looked at.
+            ReachError: it reaches neither this nor any other action that was looked at.
         """
         if self._arm is None or observation.reach is None:
             return None
         path = observation.reach.trajectory(action)
         if path is None:
             base = " ".join(f"{number:g}" for number in self._base)
-            raise UsageError(
+            raise ReachError(
                 f"{cloud}: the arm with its base at {base} reaches none of the actions that the policy proposes; move "
                 "the base or the object, or correct --base"
             )
