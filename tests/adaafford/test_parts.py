@@ -18,7 +18,7 @@ from cluster.cli.main import run as adaafford
 from shared.errors import StoreError, UsageError
 from shared.policies.policy import CORE, WEIGHTS_FILE, Policy
 from shared.segmentation.scenes import Kind
-from shared.segmentation.segmenter import SEGMENTATION_FILE, Part, Segmentation, Segmenter, begun, part_labels
+from shared.segmentation.segmenter import SEGMENTATION_FILE, Evidence, Part, Segmentation, Segmenter, begun, part_labels
 from shared.tasks import Task, task_named
 from shared.types import Float, OutcomeKind
 from tests.support.small_networks import TINY
@@ -33,7 +33,7 @@ class GivenSegmenter(Segmenter):
     def __init__(self) -> None:
         super().__init__(begun(0))
 
-    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+    def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
         thing = points[:, 2] > 0.01
         found = []
         for side, confidence in ((1.0, 0.9), (-1.0, 0.7)):
@@ -125,7 +125,7 @@ def test_the_part_is_followed_where_it_moved_to(tmp_path: Path) -> None:
 class ForgetfulSegmenter(GivenSegmenter):
     """Does not find the right door where a lamp is seen, which is above z = 2."""
 
-    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+    def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
         found = super().segment(points, camera, seed)
         return found if points[:, 2].max() < 2.0 else Segmentation(found.object, found.parts[:1])
 
@@ -151,6 +151,54 @@ def test_a_part_that_is_not_found_again_and_did_not_move_is_where_it_was(
         session(tmp_path, None).step(moved, TOLD, 3)
     history = read_history(tmp_path / "history.json")
     assert len(history.tried) == 2, "what is refused leaves the history as it was"
+
+
+class RememberingSegmenter(GivenSegmenter):
+    """Says how sure it is of the left door from 0 to 1, 0.9 for all that it is asked, and counts the scans."""
+
+    def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
+        found = super().segment(points, camera, seed)
+        evidence = Evidence(points, np.zeros((len(points), len(Kind))), points, np.ones(len(points)))
+        evidence = evidence if earlier is None else evidence.averaged(earlier)
+        confidence = {Kind.TURNING: 1 / float(np.median(evidence.scans)), Kind.SLIDING: 0.0}
+        return Segmentation(found.object, (Part(found.parts[0].points, confidence), *found.parts[1:]), evidence)
+
+
+def test_what_the_network_says_is_averaged_over_scans_between_which_nothing_moved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parts, "bundled_segmenter", RememberingSegmenter)
+    scans = [
+        write(tmp_path / f"scan-{number}.npz", room(left) + 0.001 * number)
+        for number, left in enumerate((0.9, 0.9, 0.9, 0.8, 0.8))
+    ]
+    whole, told = session(tmp_path, "0.9,0.1,0.4"), list[float]()
+    for tries, scan in enumerate(scans):
+        step = whole.step(scan, TOLD if tries else None, tries or None)
+        again = whole.step(scan, TOLD if tries else None, tries or None)
+        fresh = session(tmp_path, None).step(scan, TOLD if tries else None, tries or None)
+        assert {one.model_copy(update={"seconds": 0}).model_dump_json() for one in (step, again, fresh)} == {
+            step.model_copy(update={"seconds": 0}).model_dump_json()
+        }, "a step that is repeated, also by another process"
+        assert step.part is not None
+        told.append(1 / step.part.chosen.confidence)
+    assert np.allclose(told, [1, 2, 3, 1, 2], atol=0.01), "what moved is looked at anew"
+
+
+def test_each_scan_counts_as_much_as_another_where_its_points_are_near() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(size=(500, 3))
+    mean: Evidence | None = None
+    for number in range(3):
+        one = Evidence(points, np.full((500, 4), float(number)), points + number, np.ones(500))
+        mean = one if mean is None else one.averaged(mean)
+    assert mean is not None
+    assert np.allclose(mean.probabilities, 1.0) and np.allclose(mean.scans, 3.0)
+    elsewhere = Evidence(points + 5.0, np.zeros((500, 4)), points, np.ones(500))
+    alone = elsewhere.averaged(mean)
+    for before, after in ((elsewhere.probabilities, alone.probabilities), (elsewhere.votes, alone.votes)):
+        assert np.array_equal(before, after)
+    assert np.array_equal(alone.scans, elsewhere.scans)
 
 
 def test_around_points_that_were_pulled_in_vain_nothing_is_marked() -> None:
@@ -242,7 +290,7 @@ class GridSegmenter(Segmenter):
     def __init__(self) -> None:
         pass
 
-    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+    def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
         door = Part(np.flatnonzero(points[:, 0] < 1.0), {Kind.TURNING: 0.9, Kind.SLIDING: 0.0})
         return Segmentation(np.arange(len(points)), (door,))
 
@@ -276,7 +324,7 @@ def test_for_a_task_about_doors_the_confidence_is_that_a_part_turns() -> None:
         def __init__(self) -> None:
             pass
 
-        def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+        def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
             return Segmentation(np.arange(300), tuple(map(Part, thirds, told)))
 
     places = np.random.default_rng(0).uniform(0.5, 1, (300, 3))
