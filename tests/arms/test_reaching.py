@@ -295,7 +295,8 @@ def test_flags_of_an_arm_that_cannot_be_honoured(
     assert said in shown and shown.count("\n") == 1
 
 
-def test_a_rehearsed_arm_answers_unreachable(objects: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("static", [False, True])
+def test_a_rehearsed_arm_answers_unreachable(static: bool, objects: Path, tmp_path: Path) -> None:
     environment, again = next(simulated_again(objects, "pull-closed-door", seed=1, arm="panda"))
     told = {"task": "pull-closed-door", "object": environment.object.ref.id, "seed": 1, "number": 0, "noise": 0.0}
     setting = Rehearsal.model_validate(told | {"marked": True, "arm": "panda"})
@@ -304,6 +305,10 @@ def test_a_rehearsed_arm_answers_unreachable(objects: Path, tmp_path: Path) -> N
     seen = read_scan(tmp_path / robot.request.cloud)
     assert seen.movable is not None
     point = seen.points[seen.movable][0].tolist()
+    if static:
+        assert isinstance(environment, ArmedEnvironment)
+        observed = environment.observe()
+        point = (observed.points[observed.part_ids == 0][0] - environment.base[:3]).tolist()
     step = Step(
         do="try", tries=0, interaction=1, point=point, approach=(-1, 0, 0), forward=(0, 0, 1), belief=0.5, seconds=0
     )
