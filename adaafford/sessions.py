@@ -45,7 +45,6 @@ from shared.policies.methods import PROPOSERS
 from shared.policies.policy import Policy
 from shared.policies.proposers import AipProposer, RepeatProposer, proposer_named
 from shared.primitives import PRIMITIVES
-from shared.tasks import TASKS, task_named
 from shared.types import Action, Observation
 
 PURPOSE = "adapt"
@@ -55,6 +54,10 @@ rehearsals with real objects 45% of final actions moved a closed door, and 30% w
 50%."""
 SURFACE_POINTS = 10_000
 """Of a scan, about, that the links of an arm must not touch."""
+
+
+class ReachError(UsageError):
+    """The arm reaches none of the actions that are proposed for a scan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,15 +217,20 @@ class Session:
     ) -> None:
         policy.require("prior", "aap", *PROPOSERS.get(proposer).modules)
         self._choice = None if part is None else part_choice(part)
-        self._task = policy.task
+        self._task = policy.task_record
         if files.heatmap is not None:
             heatmap_writer(files.heatmap)
         self._adapter = Adapter(policy)
         self._files, self._budget, self._seed, self._points = files, budget, seed, points
         self._up, self._camera, self._lens, self._tell = up, camera, lens, tell
         self._arm, self._base, self._selection, self._proposer = arm, base, selection, proposer
-        self._primitive = None if arm is None else PRIMITIVES.get(task_named(policy.task).primitive)
-        self._grips = policy.task in TASKS.names() and PRIMITIVES.get(TASKS.get(policy.task).primitive).closes_fingers
+        primitive = None if self._task is None else self._task.primitive
+        self._primitive = PRIMITIVES.get(primitive) if primitive in PRIMITIVES.names() else None
+        if arm is not None and self._primitive is None:
+            raise UsageError(
+                f"--arm: how the hand moves in the policy's task '{policy.task}' is not known here; install the "
+                "package that adds it, or train the policy again if a file defined the task"
+            )
         self._seen: dict[tuple[str, ScanFrame, FollowedPart | None, tuple[Vector, ...]], _Seen] = {}
         self._steps = self._tries = 0
         self._seconds: Seconds | None = None
@@ -317,14 +325,14 @@ class Session:
         """How the arm executes an action.
 
         Raises:
-            UsageError: it reaches neither this nor any other action that was looked at.
+            ReachError: it reaches neither this nor any other action that was looked at.
         """
         if self._arm is None or observation.reach is None:
             return None
         path = observation.reach.trajectory(action)
         if path is None:
             base = " ".join(f"{number:g}" for number in self._base)
-            raise UsageError(
+            raise ReachError(
                 f"{cloud}: the arm with its base at {base} reaches none of the actions that the policy proposes; move "
                 "the base or the object, or correct --base"
             )
@@ -431,7 +439,7 @@ class Session:
 
     def _unmoved(self, history: History, count: int) -> tuple[Vector, ...]:
         """The points that were pulled in vain by the first `count` interactions."""
-        if history.part is None or not self._grips:
+        if history.part is None or self._primitive is None or not self._primitive.closes_fingers:
             return ()
         tried = ((each.point, each.outcome) for each in history.tried[:count])
         return tuple(point for point, outcome in tried if outcome is not None and outcome.held_still)

@@ -17,7 +17,7 @@ from pydantic import Field
 from adaafford.histories import TriedOutcome, parse_json
 from adaafford.parts import PartError
 from adaafford.scans import Scan, ScanFrame, action_at, npz_of
-from adaafford.sessions import Request, Session, Step
+from adaafford.sessions import ReachError, Request, Session, Step
 from collector.objects.articulation import Body
 from collector.sim.armed import ArmedEnvironment
 from collector.sim.camera import noisy
@@ -260,9 +260,9 @@ def rehearse(
         acts = [one.step for one in executed if one.step.do == "act"]
         try:
             step = session.step(robot.folder / request.cloud, request.outcome, request.interaction)
-        except PartError:
+        except (PartError, ReachError):
             if goal is None and acts:
-                break  # The final action was executed; only another one would need the part.
+                break  # The final action was executed; only another one would need the part, or be out of reach.
             raise
         if goal is None and acts:
             break

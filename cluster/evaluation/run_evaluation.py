@@ -27,7 +27,7 @@ from shared.plan import EvaluationConfig, ObjectRef, Setting
 from shared.policies.methods import METHODS, MethodName
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
 from shared.store import Store
-from shared.tasks import TASKS, Task, task_named
+from shared.tasks import Task, task_named
 
 EVALUATIONS = Path("evaluations")
 """Where tables of policies without a run go, unless a folder is named."""
@@ -127,10 +127,11 @@ def evaluate_without_run(source: str, settings: EvaluateSettings, out: Path | No
             raise UsageError(f"method '{name}' uses an earlier policy of a run; name the run with --run")
     if not methods:
         raise UsageError(f"--policy {source}: none of its networks is trained; name a trained policy")
-    if settings.task is not None and policy.task not in TASKS.names():
-        task = settings.task_record  # A file defined the policy's task; only its user can tell whether the two agree.
+    if settings.task is not None and policy.task_record is None:
+        # A file defined the task of an older policy; only its user can tell whether the two agree.
+        task = settings.task_record
     else:
-        trained = task_named(policy.task)
+        trained = policy.task_record or task_named(policy.task)
         task = _task(trained, trained.primitive, settings, settings.collection)
     if not (seen := seen_by(source)):
         Console(file=sys.stderr, highlight=False).print(f"policy {unknown(source)}", markup=False, soft_wrap=True)

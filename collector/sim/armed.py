@@ -44,8 +44,9 @@ class ArmedEnvironment(SimEnvironment):
             reached = self._armed(self._observed)[2].trajectory(action) is not None
         if reached:
             return self._environment.execute(action)
-        part = int(self._observed.part_ids[action.point_index])
-        at = float(self._environment.privileged(part).joint_positions[part - 1])
+        # On the static body nothing is to be moved, so that any joint will do, as in a trial.
+        part = max(int(self._observed.part_ids[action.point_index]), 1)
+        at = float(self._environment.state()[part - 1])
         return Outcome(OutcomeKind.UNREACHABLE, 0.0, False, at, at, np.zeros(3))
 
     def _armed(self, observed: Observation) -> tuple[Observation, Observation, ArmReach]:

@@ -314,13 +314,14 @@ def read_policy_folder(folder: Path) -> Policy:
 
 
 def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Policy:
-    task, gripper = store.setting.task, store.setting.collection.gripper
+    task, definition = store.setting.task, store.setting.task_definition
+    gripper = store.setting.collection.gripper
     if job.init is None:
         if job.stage != "prior":
             before = needed(job.stage)[-1]
             raise UsageError(f"the stage '{job.stage}' starts from a policy: add --init with the --out of '{before}'")
         seed = torch_seed(config.seed, "learner.weights") % 2**32
-        return Policy.untrained(task, config.network, seed).of_hand(gripper)
+        return Policy.untrained(task, config.network, seed).of_hand(gripper).defined_as(definition)
     policy = read_policy_folder(job.init)
     policy.require_task(task, str(job.init))
     told, has = config.network, policy.config
@@ -330,7 +331,7 @@ def _initial_policy(job: StageJob, store: Store, config: LearnerConfig) -> Polic
     policy.require(*needed(job.stage))
     if policy.gripper != gripper:
         _say(f"{job.init}: was trained with the hand '{policy.gripper}'; it is now trained with '{gripper}'")
-    policy.of_hand(gripper)
+    policy.of_hand(gripper).defined_as(definition)
     if job.stage in BASELINES.names():
         policy.begin_baseline(job.stage, torch_seed(config.seed, f"learner.{job.stage}.weights") % 2**32)
     return policy

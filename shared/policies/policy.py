@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
@@ -20,6 +20,7 @@ from shared.networks.aip import Aip
 from shared.networks.network_config import NetworkConfig
 from shared.networks.prior import Prior
 from shared.policies.methods import BASELINES, BaselineName, ModuleName
+from shared.tasks import TASKS, Task, task_named
 
 logger = logging.getLogger(__name__)
 
@@ -44,10 +45,18 @@ class PolicyDocument(StrictModel):
     format: Literal["adaafford-policy"] = "adaafford-policy"
     schema_version: int = POLICY_SCHEMA
     task: str = Field(max_length=100)
+    task_definition: Task | None = Field(None, exclude_if=lambda task: task is None)
+    """The task itself where a file defined it, as in the setting of a store; None: found by its name."""
     gripper: Name = Field(PANDA, exclude_if=lambda name: name == PANDA)
     network: NetworkConfig
     trained: tuple[ModuleName, ...] = Field(max_length=100)
     weights_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+
+    @model_validator(mode="after")
+    def _one_task(self) -> "PolicyDocument":
+        if self.task_definition is not None and self.task_definition.name != self.task:
+            raise ValueError(f"the task is '{self.task}', but '{self.task_definition.name}' is defined")
+        return self
 
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -58,6 +67,7 @@ class Policy:
 
     Attributes:
         task: name of the task that they were trained for.
+        task_definition: the task itself where a file defined it; None: found by its name.
         gripper: name of the hand whose interactions they were trained on.
         config: sizes of the networks.
         prior: Where2Act.
@@ -72,9 +82,14 @@ class Policy:
     """
 
     def __init__(
-        self, task: str, config: NetworkConfig, trained: frozenset[ModuleName] = frozenset(), gripper: str = PANDA
+        self,
+        task: str,
+        config: NetworkConfig,
+        trained: frozenset[ModuleName] = frozenset(),
+        gripper: str = PANDA,
+        task_definition: Task | None = None,
     ) -> None:
-        self.task, self.gripper = task, gripper
+        self.task, self.gripper, self.task_definition = task, gripper, task_definition
         self.config = config
         self.trained = trained
         self.prior = Prior(config)
@@ -118,7 +133,7 @@ class Policy:
             seed: of the other weights of the profiles' encoders.
         """
         config = self.config.model_copy(update={"pinch_profile": profile, "roll_symmetry": symmetry})
-        begun = Policy.untrained(self.task, config, seed).of_hand(self.gripper)
+        begun = Policy.untrained(self.task, config, seed).of_hand(self.gripper).defined_as(self.task_definition)
         weights, known = begun.modules().state_dict(), self.without_baselines().modules().state_dict()
         for name, weight in weights.items():
             if name in known:
@@ -134,7 +149,8 @@ class Policy:
     def without_baselines(self) -> "Policy":
         """A policy of the same prior, AAP and AIP, and of nothing that only an evaluation asks for."""
         with torch.device("meta"):
-            kept = Policy(self.task, self.config, self.trained.intersection(CORE), self.gripper)
+            trained = self.trained.intersection(CORE)
+            kept = Policy(self.task, self.config, trained, self.gripper, self.task_definition)
         kept.prior, kept.aap, kept.aip = self.prior, self.aap, self.aip
         return kept
 
@@ -147,6 +163,16 @@ class Policy:
         """This policy, with `gripper` as the hand that it is trained with from here on."""
         self.gripper = gripper
         return self
+
+    def defined_as(self, definition: Task | None) -> "Policy":
+        """This policy, with `definition` as what a file says of its task; None: its task is found by its name."""
+        self.task_definition = definition
+        return self
+
+    @property
+    def task_record(self) -> Task | None:
+        """The task; None of one that neither the policy nor a package here defines."""
+        return self.task_definition or (task_named(self.task) if self.task in TASKS.names() else None)
 
     def warn_of_other_hand(self, gripper: str) -> None:
         """Warn if interactions with `gripper` are not what the networks were trained on."""
@@ -217,6 +243,7 @@ class Policy:
         weights = save(_halved(tensors) if half else tensors)
         document = PolicyDocument(
             task=self.task,
+            task_definition=self.task_definition,
             gripper=self.gripper,
             network=self.config,
             trained=tuple(sorted(self.trained)),
@@ -243,7 +270,13 @@ class Policy:
             raise StoreError(f"policy: has the network '{unknown[0]}'; install the package that adds this baseline")
         # On the meta device nothing is allocated, so that absurd sizes cost nothing before they are refused.
         with torch.device("meta"):
-            policy = cls(document.task, document.network, frozenset(document.trained), document.gripper)
+            policy = cls(
+                document.task,
+                document.network,
+                frozenset(document.trained),
+                document.gripper,
+                document.task_definition,
+            )
         modules = policy.modules()
         parameters = sum(tensor.numel() for tensor in modules.state_dict().values())
         if parameters > MAX_PARAMETERS:

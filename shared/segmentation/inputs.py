@@ -177,6 +177,11 @@ class NetworkFrame:
         placed: Float = (points - self.origin) @ self.rotation.T
         return placed
 
+    def back(self, points: Float) -> Float:
+        """Points of the frame of the network, [..., 3], in the frame that they came from."""
+        found: Float = points @ self.rotation + self.origin
+        return found
+
 
 def network_input(points: Float, camera: Float, seed: int = 0) -> tuple[SegmentationInput, NetworkFrame]:
     """The input of a scan.

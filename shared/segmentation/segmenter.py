@@ -1,11 +1,14 @@
 """The segmentation of a raw scan: floor and walls by geometry, the rest by a network, and parts from its votes.
 
+What the network says of a scan may be averaged with what it said of earlier scans since which the object has not moved.
+Its errors differ from scan to scan, as the noise and the points that it is given do.
+
 Shapes: M points of a scan, N points that the network is given.
 """
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
@@ -44,7 +47,10 @@ TOUCHING_M = 0.12
 ABSORBED = 0.05
 """A thing with a smaller share of the object's points than this is left out."""
 NEAREST = 3
-"""Points of the network's input whose labels a point of the scan takes the most frequent of."""
+"""Points of the network's input whose labels a point of the scan takes the most frequent of, and points of an earlier
+scan that are averaged with a point of a later one."""
+AVERAGED_M = 0.03
+"""Points of two scans that are further apart are not averaged."""
 
 
 class SegmentationDocument(StrictModel):
@@ -81,16 +87,49 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
+class Evidence:
+    """What the network says at some points of a scan: the mean over this scan and earlier ones.
+
+    Attributes:
+        points: [N, 3].
+        probabilities: [N, kinds].
+        votes: [N, 3], the middles that are voted for, in the frame of the points.
+        scans: [N], over how many scans the mean is; it is itself a mean of what earlier points had, so no whole number.
+    """
+
+    points: Float
+    probabilities: Float
+    votes: Float
+    scans: Float
+
+    def averaged(self, earlier: "Evidence") -> "Evidence":
+        """The mean with earlier scans, of what did not move in between; each scan counts as much as another."""
+        away, near = map(np.asarray, cKDTree(earlier.points).query(self.points, NEAREST, workers=-1))
+        weights = (away < AVERAGED_M) / np.maximum((away < AVERAGED_M).sum(axis=1, keepdims=True), 1)
+        before = (weights * earlier.scans[near]).sum(axis=1)
+        share = (weights * (before / (before + self.scans))[:, None])[..., None]
+        own = 1 - share.sum(axis=1)
+        return replace(
+            self,
+            probabilities=own * self.probabilities + (share * earlier.probabilities[near]).sum(axis=1),
+            votes=own * self.votes + (share * earlier.votes[near]).sum(axis=1),
+            scans=before + self.scans,
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Segmentation:
     """What was found in a scan.
 
     Attributes:
         object: [any], the points of the scan that are of the object.
         parts: the most confident first.
+        evidence: what that was found from; None: of no use to later scans.
     """
 
     object: NDArray[np.int64]
     parts: tuple[Part, ...]
+    evidence: Evidence | None = None
 
 
 class Segmenter:
@@ -99,19 +138,26 @@ class Segmenter:
     def __init__(self, network: SegmentationNetwork) -> None:
         self._network = network
 
-    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+    def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
         """Find the object in a scan, and its movable parts.
 
         Args:
             points: [M, 3], z up, metres.
             camera: [3], in the same frame.
             seed: of the random choices.
+            earlier: of scans since which the object has not moved, in the same frame.
 
         Raises:
             UsageError: there is nothing but floor and walls, or no object.
         """
-        given, _ = network_input(points, camera, seed)
+        given, frame = network_input(points, camera, seed)
         probabilities, votes = self._evaluated(given)
+        said = probabilities.astype(np.float64), frame.back(votes.astype(np.float64))
+        evidence = Evidence(points[given.rows], *said, np.ones(len(votes)))
+        if earlier is not None:
+            evidence = evidence.averaged(earlier)
+            probabilities = evidence.probabilities.astype(np.float32)
+            votes = frame.place(evidence.votes).astype(np.float32)
         kinds = probabilities.argmax(axis=1)
         labels = part_labels(given.points, kinds, votes)
         if not (labels >= 0).any():
@@ -125,7 +171,7 @@ class Segmenter:
                 share = mine.sum() / (mine.sum() + FEW_POINTS)
                 parts.append(Part(rows, {k: float(share * probabilities[mine, k].mean()) for k in MOVABLE}))
         parts.sort(key=lambda part: -part.confidence)
-        return Segmentation(given.left[spread >= 0], tuple(parts))
+        return Segmentation(given.left[spread >= 0], tuple(parts), evidence)
 
     @torch.no_grad()
     def _evaluated(self, given: SegmentationInput) -> tuple[Float32, Float32]:

@@ -18,7 +18,8 @@ from cluster.cli.main import run as adaafford
 from shared.errors import StoreError, UsageError
 from shared.policies.policy import CORE, WEIGHTS_FILE, Policy
 from shared.segmentation.scenes import Kind
-from shared.segmentation.segmenter import SEGMENTATION_FILE, Part, Segmentation, Segmenter, begun, part_labels
+from shared.segmentation.segmenter import SEGMENTATION_FILE, Evidence, Part, Segmentation, Segmenter, begun, part_labels
+from shared.tasks import Task, task_named
 from shared.types import Float, OutcomeKind
 from tests.support.small_networks import TINY
 
@@ -32,7 +33,7 @@ class GivenSegmenter(Segmenter):
     def __init__(self) -> None:
         super().__init__(begun(0))
 
-    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+    def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
         thing = points[:, 2] > 0.01
         found = []
         for side, confidence in ((1.0, 0.9), (-1.0, 0.7)):
@@ -62,9 +63,13 @@ def write(path: Path, points: Float) -> Path:
     return path
 
 
+PULL_LID = Task(name="pull-lid", primitive="pull", revolute_only=True)
+"""As a file would define it."""
+
+
 def session(folder: Path, part: str | None = "auto", task: str = "pull-closed-door") -> Session:
     files = SessionFiles(folder / "history.json", folder / "heatmap.npz")
-    policy = Policy.untrained(task, TINY, 0)
+    policy = Policy.untrained(task, TINY, 0).defined_as(PULL_LID if task == PULL_LID.name else None)
     for name in CORE:
         policy.with_trained(name)
     return Session(policy, files, part=part, points=256)
@@ -77,6 +82,14 @@ def test_a_choice_is_auto_a_number_or_a_click() -> None:
     for wrong in ("", "0", "65", "-1", "best", "1,2", "1,2,3,4", "nan,0,0", "inf,0,0", "1e9,0,0"):
         with pytest.raises(UsageError, match="give auto, a number"):
             PartChoice.of(wrong)
+
+
+@pytest.mark.parametrize(("task", "parts"), [(PULL_LID.name, 2), ("a task that nobody defines", 3)])
+def test_what_slides_is_not_of_a_task_that_a_file_defines_for_turning_parts(
+    task: str, parts: int, tmp_path: Path
+) -> None:
+    step = session(tmp_path, task=task).step(write(tmp_path / "scan-1.npz", room()))
+    assert step.part is not None and 1 + len(step.part.alternatives) == parts
 
 
 @pytest.mark.parametrize(("part", "side"), [("auto", 1), ("1", 1), ("2", -1), ("0.9,-0.1,0.4", -1)])
@@ -112,7 +125,7 @@ def test_the_part_is_followed_where_it_moved_to(tmp_path: Path) -> None:
 class ForgetfulSegmenter(GivenSegmenter):
     """Does not find the right door where a lamp is seen, which is above z = 2."""
 
-    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+    def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
         found = super().segment(points, camera, seed)
         return found if points[:, 2].max() < 2.0 else Segmentation(found.object, found.parts[:1])
 
@@ -140,8 +153,56 @@ def test_a_part_that_is_not_found_again_and_did_not_move_is_where_it_was(
     assert len(history.tried) == 2, "what is refused leaves the history as it was"
 
 
+class RememberingSegmenter(GivenSegmenter):
+    """Says how sure it is of the left door from 0 to 1, 0.9 for all that it is asked, and counts the scans."""
+
+    def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
+        found = super().segment(points, camera, seed)
+        evidence = Evidence(points, np.zeros((len(points), len(Kind))), points, np.ones(len(points)))
+        evidence = evidence if earlier is None else evidence.averaged(earlier)
+        confidence = {Kind.TURNING: 1 / float(np.median(evidence.scans)), Kind.SLIDING: 0.0}
+        return Segmentation(found.object, (Part(found.parts[0].points, confidence), *found.parts[1:]), evidence)
+
+
+def test_what_the_network_says_is_averaged_over_scans_between_which_nothing_moved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parts, "bundled_segmenter", RememberingSegmenter)
+    scans = [
+        write(tmp_path / f"scan-{number}.npz", room(left) + 0.001 * number)
+        for number, left in enumerate((0.9, 0.9, 0.9, 0.8, 0.8))
+    ]
+    whole, told = session(tmp_path, "0.9,0.1,0.4"), list[float]()
+    for tries, scan in enumerate(scans):
+        step = whole.step(scan, TOLD if tries else None, tries or None)
+        again = whole.step(scan, TOLD if tries else None, tries or None)
+        fresh = session(tmp_path, None).step(scan, TOLD if tries else None, tries or None)
+        assert {one.model_copy(update={"seconds": 0}).model_dump_json() for one in (step, again, fresh)} == {
+            step.model_copy(update={"seconds": 0}).model_dump_json()
+        }, "a step that is repeated, also by another process"
+        assert step.part is not None
+        told.append(1 / step.part.chosen.confidence)
+    assert np.allclose(told, [1, 2, 3, 1, 2], atol=0.01), "what moved is looked at anew"
+
+
+def test_each_scan_counts_as_much_as_another_where_its_points_are_near() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(size=(500, 3))
+    mean: Evidence | None = None
+    for number in range(3):
+        one = Evidence(points, np.full((500, 4), float(number)), points + number, np.ones(500))
+        mean = one if mean is None else one.averaged(mean)
+    assert mean is not None
+    assert np.allclose(mean.probabilities, 1.0) and np.allclose(mean.scans, 3.0)
+    elsewhere = Evidence(points + 5.0, np.zeros((500, 4)), points, np.ones(500))
+    alone = elsewhere.averaged(mean)
+    for before, after in ((elsewhere.probabilities, alone.probabilities), (elsewhere.votes, alone.votes)):
+        assert np.array_equal(before, after)
+    assert np.array_equal(alone.scans, elsewhere.scans)
+
+
 def test_around_points_that_were_pulled_in_vain_nothing_is_marked() -> None:
-    scan, finder = Scan(room()), PartFinder("pull-closed-door")
+    scan, finder = Scan(room()), PartFinder(task_named("pull-closed-door"))
 
     def marked(*unmoved: Vector) -> Float:
         cut = finder.cut_out(scan, UP, CAMERA, "auto", None, "scan", unmoved=unmoved).scan
@@ -159,6 +220,8 @@ def test_around_points_that_were_pulled_in_vain_nothing_is_marked() -> None:
     ("pull-closed-door", OutcomeKind.OK, True),
     ("pull-closed-door", OutcomeKind.NO_CONTACT, False),
     ("push", OutcomeKind.OK, False),
+    (PULL_LID.name, OutcomeKind.OK, True),
+    ("a task that nobody defines", OutcomeKind.OK, False),
 ])  # fmt: skip
 def test_a_pull_that_moves_nothing_is_not_made_again_there(
     policy: str, kind: OutcomeKind, elsewhere: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -207,7 +270,7 @@ def test_what_cannot_be_found_is_said_in_one_line(tmp_path: Path) -> None:
 def test_a_marked_scan_and_a_history_without_part_are_refused(tmp_path: Path) -> None:
     marked = checked_scan(room(), movable=np.ones(len(room())))
     with pytest.raises(UsageError, match="leave out --part"):
-        PartFinder("push").cut_out(marked, UP, CAMERA, "auto", None, "scan")
+        PartFinder(task_named("push")).cut_out(marked, UP, CAMERA, "auto", None, "scan")
     object_alone = room()[3000:]
     session(tmp_path, None).step(write(tmp_path / "scan-1.npz", object_alone))
     with pytest.raises(UsageError, match="begun without a part"):
@@ -216,7 +279,7 @@ def test_a_marked_scan_and_a_history_without_part_are_refused(tmp_path: Path) ->
 
 def test_a_task_that_acts_on_all_parts_finds_what_slides() -> None:
     scan = Scan(room())
-    cut = PartFinder("push").cut_out(scan, UP, CAMERA, "3", None, "scan")
+    cut = PartFinder(task_named("push")).cut_out(scan, UP, CAMERA, "3", None, "scan")
     assert cut.answer.chosen.kind == "sliding"
     assert cut.scan.movable is not None and cut.scan.movable.sum() == 100
 
@@ -227,7 +290,7 @@ class GridSegmenter(Segmenter):
     def __init__(self) -> None:
         pass
 
-    def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+    def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
         door = Part(np.flatnonzero(points[:, 0] < 1.0), {Kind.TURNING: 0.9, Kind.SLIDING: 0.0})
         return Segmentation(np.arange(len(points)), (door,))
 
@@ -239,13 +302,13 @@ def test_points_that_float_between_surfaces_are_not_of_the_object() -> None:
 
     floating = np.array([[1.2, -0.03, 0.1], [0.95, 0.63, 0.3], [1.1, 0.62, 0.5]])
     scan = Scan(np.concatenate([plane(0.9), plane(1.4), floating]))
-    cut = PartFinder("push", GridSegmenter()).cut_out(scan, UP, CAMERA, "auto", None, "scan")
+    cut = PartFinder(task_named("push"), GridSegmenter()).cut_out(scan, UP, CAMERA, "auto", None, "scan")
     assert np.array_equal(cut.scan.points, np.concatenate([plane(0.9), plane(1.4)]))
     assert cut.scan.rows is not None and np.array_equal(cut.scan.rows, np.arange(7200))
     assert len(cut.shades) == len(scan.points)
     # Where one of several views is much finer, the points of the others are no noise.
     uneven = Scan(np.concatenate([plane(0.9)[:1800], plane(1.4)[::7]]))
-    whole = PartFinder("push", GridSegmenter()).cut_out(uneven, UP, CAMERA, "auto", None, "scan")
+    whole = PartFinder(task_named("push"), GridSegmenter()).cut_out(uneven, UP, CAMERA, "auto", None, "scan")
     assert np.array_equal(whole.scan.points, uneven.points)
 
 
@@ -261,12 +324,12 @@ def test_for_a_task_about_doors_the_confidence_is_that_a_part_turns() -> None:
         def __init__(self) -> None:
             pass
 
-        def segment(self, points: Float, camera: Float, seed: int = 0) -> Segmentation:
+        def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
             return Segmentation(np.arange(300), tuple(map(Part, thirds, told)))
 
     places = np.random.default_rng(0).uniform(0.5, 1, (300, 3))
     for task, expected in (("push", [0.9, 0.8, 0.2]), ("pull-closed-door", [0.3, 0.2])):
-        answer = PartFinder(task, Told()).cut_out(Scan(places), UP, CAMERA, "auto", None, "scan").answer
+        answer = PartFinder(task_named(task), Told()).cut_out(Scan(places), UP, CAMERA, "auto", None, "scan").answer
         assert [part.confidence for part in (answer.chosen, *answer.alternatives)] == expected
     assert {part.kind for part in (answer.chosen, *answer.alternatives)} == {"turning"}
 

@@ -13,7 +13,7 @@ from adaafford.histories import TriedOutcome, read_history
 from adaafford.parts import PartError
 from adaafford.pretrained import load_policy
 from adaafford.scans import read_scan
-from adaafford.sessions import Session, SessionFiles, Step
+from adaafford.sessions import ReachError, Session, SessionFiles, Step
 from cluster.cli.library import simulated, simulated_again
 from cluster.cli.main import run as adaafford
 from cluster.evaluation import rehearsal
@@ -205,8 +205,12 @@ def test_a_rehearsal_that_is_ended_at_every_write_counts_everything_once(
 
 
 @pytest.mark.parametrize("succeeded", [True, False])
-def test_a_final_action_counts_where_the_part_is_not_found_after_it(
-    succeeded: bool, make_robot: Callable[..., SimulatedRobot], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("error", [PartError, ReachError])
+def test_a_final_action_counts_where_no_other_can_be_proposed_after_it(
+    succeeded: bool,
+    error: type[UsageError],
+    make_robot: Callable[..., SimulatedRobot],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(SapienEnvironment, "execute", lambda *_: Outcome(OutcomeKind.OK, 0.1, succeeded))
     robot = make_robot()
@@ -215,14 +219,33 @@ def test_a_final_action_counts_where_the_part_is_not_found_after_it(
 
     def step(cloud: Path, outcome: TriedOutcome | None = None, interaction: int | None = None) -> Step:
         if interaction == 2:
-            raise PartError("it is not found again")
+            raise error("it is not found again, or out of reach")
         return seen(cloud, outcome, interaction)
 
     monkeypatch.setattr(session, "step", step)
     assert rehearsal.rehearse(robot, session, lambda *_: None) is succeeded
     assert [one.step.do for one in robot.executed] == ["try", "act"]
-    with pytest.raises(PartError):
+    with pytest.raises(error):
         rehearsal.rehearse(robot, session, lambda *_: None, rehearsal.Goal(50.0, within=4))
+
+
+@pytest.mark.parametrize("error", [PartError, ReachError])
+def test_a_rollout_in_which_nothing_can_be_proposed_is_given_up_and_the_next_one_begins(
+    error: type[UsageError],
+    objects: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def step(*_: object) -> Step:
+        raise error("nothing can be proposed")
+
+    monkeypatch.setattr(Session, "step", step)
+    flags = ["--task", TASK, "--policy", TASK, "--objects", str(objects), "--rollouts", "2"]
+    assert adaafford(["rehearse", str(tmp_path / "new"), *flags]) == 0
+    said = capsys.readouterr().out
+    assert [line.split(":")[0] for line in said.splitlines()[:2]] == ["0001 given up", "0002 given up"]
+    assert "0 of 2 final actions succeeded" in said
 
 
 def test_a_goal_is_pursued_by_several_actions(make_robot: Callable[..., SimulatedRobot], tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ from shared.store.codecs.tables import read_table, table_bytes
 from shared.store.layout import ARM_VERSION
 from shared.store.validity import check_rollouts
 from shared.store.writer import rollout_digest
-from shared.tasks import task_named
+from shared.tasks import Task, task_named
 from shared.types import Action, HiddenDynamics, Observation, OutcomeKind
 from tests.adaafford.test_adapt_command import front
 from tests.collector.test_determinism import ROLLOUTS, collected
@@ -254,6 +254,14 @@ def test_a_step_gives_the_trajectory_of_its_action(tmp_path: Path, up: tuple[flo
     assert heat["reachable"].shape == heat["affordance"].shape and heat["reachable"].any()
 
 
+def test_an_arm_needs_a_task_that_is_known(tmp_path: Path) -> None:
+    policy, files = policy_with_all(), SessionFiles(tmp_path / "history.json", None)
+    policy.task = "push-slowly"
+    with pytest.raises(UsageError, match="in the policy's task 'push-slowly' is not known here"):
+        Session(policy, files, arm=PANDA)
+    Session(policy.defined_as(Task(name="push-slowly", primitive="push")), files, arm=PANDA)
+
+
 def test_an_arm_that_reaches_nothing_is_said_and_nothing_is_written(tmp_path: Path) -> None:
     session = session_of(tmp_path, base=(5.0, 0.0, 0.0, 0.0))
     with pytest.raises(UsageError, match="reaches none of the actions"):
@@ -287,7 +295,8 @@ def test_flags_of_an_arm_that_cannot_be_honoured(
     assert said in shown and shown.count("\n") == 1
 
 
-def test_a_rehearsed_arm_answers_unreachable(objects: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("static", [False, True])
+def test_a_rehearsed_arm_answers_unreachable(static: bool, objects: Path, tmp_path: Path) -> None:
     environment, again = next(simulated_again(objects, "pull-closed-door", seed=1, arm="panda"))
     told = {"task": "pull-closed-door", "object": environment.object.ref.id, "seed": 1, "number": 0, "noise": 0.0}
     setting = Rehearsal.model_validate(told | {"marked": True, "arm": "panda"})
@@ -296,6 +305,10 @@ def test_a_rehearsed_arm_answers_unreachable(objects: Path, tmp_path: Path) -> N
     seen = read_scan(tmp_path / robot.request.cloud)
     assert seen.movable is not None
     point = seen.points[seen.movable][0].tolist()
+    if static:
+        assert isinstance(environment, ArmedEnvironment)
+        observed = environment.observe()
+        point = (observed.points[observed.part_ids == 0][0] - environment.base[:3]).tolist()
     step = Step(
         do="try", tries=0, interaction=1, point=point, approach=(-1, 0, 0), forward=(0, 0, 1), belief=0.5, seconds=0
     )

@@ -38,6 +38,7 @@ from shared.plan import EvaluationConfig, Plan, Setting
 from shared.policies.methods import METHODS
 from shared.policies.policy import WEIGHTS_FILE, Policy
 from shared.store import Store
+from shared.tasks import Task
 from tests.support.finished_run import SMALL_NETWORK, make_finished_run
 
 FAST = EvaluateSettings(methods=("where2act", "ours-random"), budgets=(1,), trials=2, queries=4, per_shard=1, workers=0)
@@ -318,6 +319,22 @@ def test_evaluate_policy_has_the_hand_of_the_policy_unless_another_is_named(
         settings = FAST.model_copy(update={"objects": finished / "objects", "collection": collection})
         evaluate_without_run(str(tmp_path), settings, None)
     assert [subject.collection.gripper for subject in told] == ["suction", "suction", "wide"]
+
+
+def test_evaluate_policy_knows_the_task_that_a_file_defined_in_its_training(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Task] = []
+    monkeypatch.setattr("cluster.evaluation.run_evaluation._evaluate", lambda subject, task, *_: told.append(task))
+    mine = Task(name="push-slowly", primitive="push")
+    policy = Policy.untrained(mine.name, SMALL_NETWORK, 0).with_trained("prior").defined_as(mine)
+    for name, data in policy.to_files().items():
+        (tmp_path / name).write_bytes(data)
+    settings = FAST.model_copy(update={"objects": finished / "objects"})
+    evaluate_without_run(str(tmp_path), settings, None)
+    assert told == [mine]
+    with pytest.raises(UsageError, match="the policy is trained to push"):
+        evaluate_without_run(str(tmp_path), settings.model_copy(update={"task": "pull"}), None)
 
 
 def test_evaluate_policy_with_a_run_is_the_evaluation_of_the_run(

@@ -37,6 +37,7 @@ from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.progress import Progress
 from shared.store.coverage import Snapshot
 from shared.store.store import Store
+from shared.tasks import Task
 from tests.support.as_toml import as_toml
 from tests.support.small_networks import TINY
 from tests.support.small_trainings import FAST, fabricated_plan, fabricated_rollouts, make_store
@@ -476,6 +477,20 @@ def test_a_second_learner_in_the_same_folder_is_refused(
         assert run(told) == 2
     assert "is in use by process" in capsys.readouterr().err
     assert not (out / WEIGHTS_FILE).exists()
+
+
+def test_a_policy_records_the_task_that_its_store_defines(tmp_path: Path) -> None:
+    lid = Task(name="pull-lid", primitive="pull", revolute_only=True)
+    setting = fabricated_plan().setting.model_copy(update={"task": lid.name, "task_definition": lid})
+    make_store(tmp_path / "store", plan=Plan(setting=setting))
+    first = run_stage(StageJob("prior", tmp_path / "store", tmp_path / "first"), FAST)
+    assert first.task_record == read_policy_folder(tmp_path / "first").task_record == lid
+    # As an earlier version left it.
+    for name, data in first.defined_as(None).to_files().items():
+        (tmp_path / "first" / name).write_bytes(data)
+    assert read_policy_folder(tmp_path / "first").task_record is None
+    tuned = run_stage(StageJob("prior", tmp_path / "store", tmp_path / "tuned", tmp_path / "first"), FAST)
+    assert tuned.task_record == lid
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from safetensors.torch import load, save
 from shared.errors import StoreError, UsageError
 from shared.networks.network_config import NetworkConfig
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
+from shared.tasks import TASKS, Task
 from tests.support.small_networks import TINY
 
 
@@ -46,6 +47,19 @@ def test_a_policy_records_the_hand_of_its_training_and_warns_of_another(
     assert caplog.messages == [
         "the policy was trained with the hand 'suction', and is used with the hand 'panda', of which it knows nothing"
     ]
+
+
+def test_a_policy_records_the_task_that_a_file_defined(files: dict[str, bytes]) -> None:
+    assert "task_definition" not in json.loads(files[POLICY_FILE])
+    assert Policy.from_files(files).task_record == TASKS.get("push")
+    lid = Task(name="pull-lid", primitive="pull", revolute_only=True)
+    begun = Policy.untrained("pull-lid", TINY, seed=3)
+    assert begun.task_record is None, "no package defines it"
+    defined = begun.defined_as(lid).with_pinch(True, False, 1).without_baselines().to_files()
+    assert Policy.from_files(defined).task_record == lid
+    foreign = resealed(defined, defined[WEIGHTS_FILE], task="push")
+    with pytest.raises(StoreError, match="'pull-lid' is defined"):
+        Policy.from_files(foreign)
 
 
 def test_first_weights_depend_on_the_seed_alone() -> None:

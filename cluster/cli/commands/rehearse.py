@@ -167,7 +167,7 @@ def _follow(robot: "SimulatedRobot") -> int:
 def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy") -> bool:
     """A whole session with one robot; whether it succeeded."""
     from adaafford.parts import AUTO, PartError
-    from adaafford.sessions import Session, SessionFiles
+    from adaafford.sessions import ReachError, Session, SessionFiles
     from cluster.evaluation.rehearsal import Goal, rehearse
     from shared.arms.arm import arm_of
 
@@ -196,7 +196,7 @@ def _played(command: RehearseCommand, robot: "SimulatedRobot", policy: "Policy")
     goal = None if command.goal is None else Goal(command.goal, command.within, command.repeat)
     try:
         return rehearse(robot, session, tell, goal)
-    except PartError as error:
+    except (PartError, ReachError) as error:
         print(plain(f"{folder.name} given up: {error}"), flush=True)
         return False
 
