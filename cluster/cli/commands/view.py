@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from adaafford.recordings import WHOLE, Selection, is_recording
-from cluster.config.flags import parse_flags
+from cluster.config.flags import OutFile, parse_flags
 from shared.errors import UsageError
 from shared.io.text import plain
 
@@ -42,7 +42,7 @@ class ViewCommand:
     """Folder of the store's objects, for the simulation. Default: the run's, or the procedural ones of the store."""
     port: int = 8080
     """Of 127.0.0.1; 0: a free one. From another machine: ssh -L 8080:127.0.0.1:8080 HOST."""
-    out: Path | None = None
+    out: OutFile | None = None
     """The file that the marks of a scan are saved to (.npz). Default: SCAN-marked.npz beside the scan."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
     """Replace that file if it is there."""
