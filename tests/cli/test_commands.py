@@ -182,6 +182,34 @@ def test_a_signal_says_how_to_go_on(number: signal.Signals) -> None:
     )
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_whose_exception_a_library_drops_ends_the_command(number: signal.Signals) -> None:
+    done = with_signals(
+        "import time, weakref",
+        "def version(args):",
+        "    thing = {*()}",
+        f"    reference = weakref.ref(thing, lambda _: signal.raise_signal({int(number)}))",
+        "    del thing",
+        "    time.sleep(100)",
+        "main.import_module('cluster.cli.commands.version').main = version",
+        "sys.argv[1:] = ['version']",
+    )
+    assert (done.returncode, done.stderr) == (128 + number, "adaafford: interrupted\n")
+
+
+@pytest.mark.parametrize("error", ["AttributeError('half imported')", "StoreError('damaged')"])
+def test_what_fails_after_a_signal_is_an_interruption(error: str) -> None:
+    done = with_signals(
+        "from shared.errors import StoreError",
+        "def version(args):",
+        "    try: signal.raise_signal(signal.SIGINT)",
+        f"    except BaseException: raise {error} from None",
+        "main.import_module('cluster.cli.commands.version').main = version",
+        "sys.argv[1:] = ['version']",
+    )
+    assert (done.returncode, done.stderr) == (130, "adaafford: interrupted\n")
+
+
 def test_an_interrupt_before_the_command_line_is_imported_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -59,11 +59,11 @@ def main(args: list[str]) -> int:
     with viewing(command) as server:
         port = server.get_port()
         # An exception in the middle of printing would have the line printed twice.
-        signal.signal(signal.SIGINT, lambda *_: ended.set())
+        before = signal.signal(signal.SIGINT, lambda *_: ended.set())
         print(f"http://127.0.0.1:{port} shows it, on this machine only; Ctrl-C ends the viewer")
         print(f"from another machine: ssh -L {port}:127.0.0.1:{port} HOST, then the same address", flush=True)
         ended.wait()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, before)
     print("the viewer has ended")
     return 0
 
