@@ -11,7 +11,7 @@ The same live workers serve every collection round; each round's policy reaches 
 
 import sys
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -31,7 +31,7 @@ from collector.setting import make_setting, packages_used
 from learner.alternation import AlternationStep, Collect, Publish, alternation, perform
 from learner.settings import LearnerConfig
 from learner.stages.jobs import StageJob, as_json
-from shared.errors import UsageError
+from shared.errors import AdaAffordError, UsageError
 from shared.io.files import DRIVER_LOCK, exclusive_lock, read_bounded, write_atomically
 from shared.io.text import plain
 from shared.plan import Plan, Setting
@@ -76,6 +76,10 @@ class Campaign:
         with exclusive_lock(run.path / DRIVER_LOCK), closing(self._learner):
             run_log = RunLog(run.log)
             run_log.note("attempt", workers=config.workers, software=software_versions())
+            for place in (run.store, run.evaluation):
+                # A step that has finished does not look into its store again; others say what is wrong with theirs.
+                with suppress(AdaAffordError):
+                    Store.open(place).sweep()
             changed = changed_versions(run.begun_with())
             if changed and any(step.name not in run_log.finished for step in steps):
                 self._say(f"begun with other software: {changed}; new results may differ because of it")

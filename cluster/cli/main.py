@@ -18,7 +18,7 @@ import adaafford  # noqa: F401 - it sees first that nothing shadows our packages
 from cluster.runs.streams import Streams, configure
 from shared.errors import AdaAffordError, UsageError
 from shared.extras import extra_of, missing_line, require
-from shared.interrupts import ENDING
+from shared.interrupts import ENDING, heeded
 from shared.io.redaction import without_secrets
 from shared.io.text import plain
 
@@ -171,8 +171,9 @@ def guarded(command: Callable[[], int], args: list[str]) -> int:
 def _told(command: Callable[[], int], args: list[str]) -> int:
     """See `guarded`; Ctrl-C is raised."""
     try:
-        code = command()
-        sys.stdout.flush()
+        with heeded():
+            code = command()
+            sys.stdout.flush()
     except AdaAffordError as error:
         return _complain(str(error), error.exit_code)
     except ModuleNotFoundError as error:

@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import os
 import re
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout, suppress
@@ -10,10 +11,10 @@ from functools import partial
 from io import StringIO
 from pathlib import Path
 from types import GenericAlias, NoneType
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import tyro
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, TypeAdapter, ValidationError
 from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
@@ -31,6 +32,27 @@ Model = TypeVar("Model", bound=BaseModel)
 Command = TypeVar("Command")
 Action = tuple[type[Any], Callable[[Any], int]]
 """What declares the flags of an action, and what is run with them; returns the exit code."""
+
+
+def _can_be_folder(path: Path) -> Path:
+    there = next((each for each in (path, *path.parents) if os.path.lexists(each)), None)
+    if there is not None and not there.is_dir():
+        raise UsageError(f"{path}: no folder can be made of this name ({there} is no folder); name another")
+    return path
+
+
+def _can_be_file(path: Path) -> Path:
+    if path.is_dir():
+        raise UsageError(f"{path}: is a folder; name a file")
+    if not path.parent.is_dir():
+        raise UsageError(f"{path}: there is no folder {path.parent}; create it, or name another place")
+    return path
+
+
+OutFolder = Annotated[Path, AfterValidator(_can_be_folder)]
+"""A folder that a command writes, which is made where missing; what can be none is refused before anything is done."""
+OutFile = Annotated[Path, AfterValidator(_can_be_file)]
+"""A file that a command writes, as `OutFolder`."""
 
 FLAG_STYLE = (tyro.conf.AvoidSubcommands, tyro.conf.EnumChoicesFromValues)
 FLAG_TYPES = ConstructorRegistry()

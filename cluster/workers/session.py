@@ -8,7 +8,6 @@ import logging
 import os
 import re
 import secrets
-import signal
 import socket
 import subprocess
 import warnings
@@ -27,7 +26,15 @@ from collector.watchdog import Limits
 from shared.errors import StoreError, UsageError, WorkerError
 from shared.extras import require_packages
 from shared.interrupts import undisturbed
-from shared.io.files import is_gone, process_name, read_bounded, remove_if_abandoned, remove_tree, temporary_name
+from shared.io.files import (
+    DAY_S,
+    is_abandoned,
+    process_name,
+    read_bounded,
+    remove_if_abandoned,
+    remove_tree,
+    temporary_name,
+)
 from shared.io.private import private_folder
 from shared.store import Store
 from shared.store.crash_log import CrashLog
@@ -153,10 +160,7 @@ def ray_session(workers: int, address: str | None = None) -> Iterator[None]:
         UsageError: there is no cluster at `address`, or no private folder for a session of our own.
         WorkerError: a session of our own does not come up, however often it is tried.
     """
-    on_terminate = signal.getsignal(signal.SIGTERM)
     with _private_session(workers) if address is None else _cluster(address):
-        # Ray's native part has put a handler of its own in place of ours.
-        signal.signal(signal.SIGTERM, on_terminate)
         yield
 
 
@@ -387,7 +391,7 @@ def _session_folder() -> Iterator[Path]:
     """
     sessions = private_folder("ray")
     for left in sessions.iterdir():
-        if not remove_if_abandoned(left) and _owner_is_gone(left):
+        if not remove_if_abandoned(left) and _is_abandoned(left):
             _remove_session(left)
     new, folder = sessions / temporary_name("session"), sessions / secrets.token_hex(3)
     new.mkdir(0o700)
@@ -400,12 +404,19 @@ def _session_folder() -> Iterator[Path]:
             _remove_session(folder)
 
 
-def _owner_is_gone(folder: Path) -> bool:
+def _is_abandoned(folder: Path) -> bool:
     try:
-        return is_gone(read_bounded(folder / _OWNER_FILE, 1 << 10).decode(errors="replace"))
+        owner = read_bounded(folder / _OWNER_FILE, 1 << 10).decode(errors="replace")
+        # Whether the owner lives in another container or did so before this boot, only the folder can tell: a live
+        # session writes to its logs every few seconds.
+        newest = max((folder, *folder.rglob("*")), key=lambda path: path.lstat().st_mtime)
+        return is_abandoned(newest, owner, DAY_S)
     except StoreError:
         # None, so this is no folder of a session any more: agents of one that was killed have made it again.
         return True
+    except OSError:
+        # It changes right now, so somebody is at work in it.
+        return False
 
 
 def _remove_session(folder: Path) -> None:
@@ -445,20 +456,25 @@ def _set_environment(values: Mapping[str, str | None]) -> None:
 def _ray() -> Iterator[Any]:
     """Ray, made quiet, while it starts; what it has kept of the environment is read anew.
 
-    Its Python part puts no handler in place of ours, which would end this process without a word while Ray starts.
+    Neither its Python part nor its native part puts a handler of SIGTERM in place of ours, which would end this process
+    without a word while Ray starts. Signals wait while its native part starts, which crashes where it is interrupted.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ray's own deprecations; a user can do nothing about them.
         with ray_process.without_slow_imports():
             import ray
         from ray import _raylet
-        from ray._private import utils, worker
+        from ray._private import ray_constants, utils, worker
 
         native: Any = _raylet
         worker.print_to_stdstream = _to_log
         native.Config.initialize("")
         native.AuthenticationTokenLoader.instance().reset_cache()
-        with _changed_attributes(utils, {"set_sigterm_handler": lambda handler: None}):
+        with (
+            _changed_attributes(utils, {"set_sigterm_handler": lambda handler: None}),
+            _changed_attributes(ray_constants, {"RAY_DISABLE_FAILURE_SIGNAL_HANDLER": True}),
+            _changed_attributes(worker, {"connect": undisturbed()(worker.connect)}),
+        ):
             yield ray
 
 

@@ -16,7 +16,7 @@ from collector.objects.articulation import PartSummary
 from shared.config import StrictModel
 from shared.errors import StoreError, UsageError
 from shared.io.documents import parse_document
-from shared.io.files import read_bounded, temporary_name
+from shared.io.files import read_bounded, write_atomically
 from shared.io.private import cache_folder
 from shared.plan import ObjectRef
 from shared.software import software_versions
@@ -100,14 +100,8 @@ class ScanCache:
             data = kept.model_dump_json().encode()
             if len(data) > MAX_BYTES:
                 return
-            place = _place(self._cache, folder)
-            temporary = place.with_name(temporary_name(place.name))
-            try:
-                # Bytes that a crash loses are read anew, so nothing waits for the disk.
-                temporary.write_bytes(data)
-                temporary.replace(place)
-            finally:
-                temporary.unlink(missing_ok=True)
+            # Bytes that a crash loses are read anew, so nothing waits for the disk.
+            write_atomically(_place(self._cache, folder), data, forced=False)
 
 
 def _place(cache: Path, folder: Path) -> Path:

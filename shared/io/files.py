@@ -48,8 +48,13 @@ DAY_S = 24 * 3600.0
 logger = logging.getLogger(__name__)
 
 
-def write_durably(path: Path, data: bytes) -> None:
+def write_durably(path: Path, data: bytes, *, forced: bool = True) -> None:
     """Write a new file and force it to the disk; not atomic, so for places that nobody reads yet.
+
+    Args:
+        path: the file.
+        data: its bytes.
+        forced: whether to wait until the disk has it.
 
     Raises:
         OSError: the file exists already, or cannot be written.
@@ -57,7 +62,8 @@ def write_durably(path: Path, data: bytes) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     try:
         _write_all(descriptor, data)
-        os.fsync(descriptor)
+        if forced:
+            os.fsync(descriptor)
     finally:
         os.close(descriptor)
 
@@ -156,16 +162,24 @@ def sync_tree(folder: Path) -> None:
     sync_folder(folder)
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Put `data` at `path`, replacing what was there: a reader finds the old bytes or the new, after any crash."""
+def write_atomically(path: Path, data: bytes, *, forced: bool = True) -> None:
+    """Put `data` at `path`, replacing what was there: a reader finds the old bytes or the new, after any crash.
+
+    Args:
+        path: the file. What killed writers left beside it is removed when a process first writes there.
+        data: its bytes.
+        forced: whether to wait until the disk has it; otherwise a power cut may lose the new bytes and the old ones.
+    """
+    remove_remnants_once(path.parent)
     temporary = path.parent / temporary_name(path.name)
     with _naming(path):
         try:
-            write_durably(temporary, data)
+            write_durably(temporary, data, forced=forced)
             temporary.rename(path)
         finally:
             temporary.unlink(missing_ok=True)
-        sync_folder(path.parent)
+        if forced:
+            sync_folder(path.parent)
 
 
 @contextmanager
@@ -181,9 +195,12 @@ def _naming(path: Path) -> Iterator[None]:
 def create_exclusively(path: Path, data: bytes) -> bool:
     """Put `data` at `path` unless something is there: whole or not at all, and by one of several writers only.
 
+    What killed writers left beside it is removed when a process first writes there.
+
     Returns:
         Whether this call made the file.
     """
+    remove_remnants_once(path.parent)
     temporary = path.parent / temporary_name(path.name)
     with _naming(path):
         try:
@@ -505,6 +522,12 @@ def remove_remnants(folder: Path) -> None:
         # Those of other users may not be removable, which is no reason not to work here.
         with suppress(OSError):
             remove_if_abandoned(remnant)
+
+
+@cache
+def remove_remnants_once(folder: Path) -> None:
+    """`remove_remnants`, for those who write many files: to list a large folder for each takes long."""
+    remove_remnants(folder)
 
 
 def is_abandoned(path: Path, process: str, after_s: float) -> bool:

@@ -562,7 +562,10 @@ def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
         (["--outcome", "0", "--grasp-width", "20"], "--outcome: setting 'grasp_width'"),
         (["--outcome", "0", "--grasp-width", "nan"], "--outcome: setting 'grasp_width'"),
         (["--out", "heat.obj"], "not a kind of heatmap"),
-        (["--out", "nowhere/heat.ply", "--cloud", "none.ply"], "--out nowhere/heat.ply: there is no folder nowhere"),
+        (
+            ["--out", "nowhere/heat.ply", "--cloud", "none.ply"],
+            "nowhere/heat.ply: there is no folder nowhere; create it",
+        ),
         (["--budget", "0"], "at least one interaction"),
         (["--proposer", "afps"], "allowed: aip, information-gain"),
         (["--points", "9"], "allowed are 64 to 16384"),

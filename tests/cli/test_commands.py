@@ -109,6 +109,59 @@ def test_a_place_with_other_things_is_refused_before_objects_are_made(
         assert not (tmp_path / f"{name}-objects").exists()
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "run --out FILE",
+        "evaluate --policy push-faucet --objects GONE --out FILE",
+        "compare GONE --out FILE",
+        "rehearse FILE --task push",
+        "export-policy GONE --out FILE",
+        "calibrate --policy GONE --store GONE --out FILE",
+        "train prior --store GONE --out FILE",
+        "train segmentation --scenes GONE --out FILE",
+        "learn --store GONE --out FILE",
+        "curve --store GONE --runs a=GONE --out FILE",
+        "objects generate FILE",
+        "objects import GONE --out FILE",
+        "objects export GONE --out FILE",
+        "objects scenes GONE FILE",
+        "bench collect --out FILE",
+    ],
+)
+def test_a_file_in_the_place_of_a_folder_is_refused_before_anything_is_done(
+    command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    (tmp_path / "nowhere").symlink_to("gone")
+    for out in (file, file / "below", tmp_path / "nowhere"):
+        words = [str({"FILE": out, "GONE": tmp_path / "missing"}.get(word, word)) for word in command.split()]
+        line = complaint(capsys, *words)
+        assert f"{out}: no folder can be made of this name" in line
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "objects preview GONE OUT.png",
+        "objects film GONE OUT.png",
+        "store replay GONE --objects GONE --video OUT.gif",
+        "adapt --cloud GONE --history GONE --out OUT.ply",
+        "view GONE.ply --out OUT.npz",
+    ],
+)
+def test_a_file_is_refused_where_it_cannot_be_before_anything_is_done(
+    command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    name = command.rpartition(".")[2]
+    (tmp_path / f"folder.{name}").mkdir()
+    for out, said in (("none/out", "there is no folder"), ("folder", "is a folder; name a file")):
+        words = command.replace("GONE", str(tmp_path / "missing")).replace("OUT", str(tmp_path / out)).split()
+        assert f"{tmp_path / out}.{name}: {said}" in complaint(capsys, *words)
+
+
 def test_a_picture_of_another_kind_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for action in ("preview", "film"):
         out = tmp_path / "sheet.xyz"
@@ -127,6 +180,34 @@ def test_a_signal_says_how_to_go_on(number: signal.Signals) -> None:
         "adaafford: interrupted; committed data stay, and the same command continues: "
         "adaafford collect --store 'my store'\n"
     )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_whose_exception_a_library_drops_ends_the_command(number: signal.Signals) -> None:
+    done = with_signals(
+        "import time, weakref",
+        "def version(args):",
+        "    thing = {*()}",
+        f"    reference = weakref.ref(thing, lambda _: signal.raise_signal({int(number)}))",
+        "    del thing",
+        "    time.sleep(100)",
+        "main.import_module('cluster.cli.commands.version').main = version",
+        "sys.argv[1:] = ['version']",
+    )
+    assert (done.returncode, done.stderr) == (128 + number, "adaafford: interrupted\n")
+
+
+@pytest.mark.parametrize("error", ["AttributeError('half imported')", "StoreError('damaged')"])
+def test_what_fails_after_a_signal_is_an_interruption(error: str) -> None:
+    done = with_signals(
+        "from shared.errors import StoreError",
+        "def version(args):",
+        "    try: signal.raise_signal(signal.SIGINT)",
+        f"    except BaseException: raise {error} from None",
+        "main.import_module('cluster.cli.commands.version').main = version",
+        "sys.argv[1:] = ['version']",
+    )
+    assert (done.returncode, done.stderr) == (130, "adaafford: interrupted\n")
 
 
 def test_an_interrupt_before_the_command_line_is_imported_is_one_line(

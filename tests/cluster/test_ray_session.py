@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from ipaddress import ip_address
@@ -25,6 +26,7 @@ from cluster.workers.session import ray_session
 from shared.errors import UsageError, WorkerError
 from shared.interrupts import undisturbed
 from shared.io import private
+from shared.io.files import DAY_S
 
 ROOT = Path(__file__).parents[2]
 SOME_USER = ["unshare", "--user", "--map-user=54321", "--map-group=54321"]
@@ -440,18 +442,38 @@ def test_sigterm_ends_a_session_that_starts_as_it_ends_any_command(
     assert list(sessions.iterdir()) == []
 
 
-def test_our_handler_of_sigterm_is_in_its_place_while_a_session_lives(
-    sessions: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # As Ray's native part does.
-    monkeypatch.setattr("ray.init", lambda **_: signal.signal(signal.SIGTERM, signal.SIG_IGN))
-    monkeypatch.setattr("ray.shutdown", lambda: None)
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        with ray_session(1):
-            assert signal.getsignal(signal.SIGTERM) is before
-    finally:
-        signal.signal(signal.SIGTERM, before)
+@pytest.mark.timeout(400)
+def test_sigterm_just_after_the_native_part_of_ray_has_started_ends_a_command_as_any_other(scratch: Path) -> None:
+    lines = (
+        "import signal, sys; from ray import _raylet; from cluster.workers.session import ray_session",
+        "native = _raylet.CoreWorker",
+        "def disturbed(*args):",
+        "    started = native(*args)",
+        "    signal.raise_signal(signal.SIGTERM)",
+        "    return started",
+        "_raylet.CoreWorker = disturbed",
+        "signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(7))",
+        "with ray_session(1): pass",
+    )
+    told = {**os.environ, "TMPDIR": str(scratch)}
+    done = subprocess.run([sys.executable, "-c", "\n".join(lines)], cwd=ROOT, env=told, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (7, "", "")
+    assert list((scratch / f"adaafford-{os.geteuid()}" / "ray").iterdir()) == []
+
+
+def test_a_session_of_an_earlier_boot_goes_once_nothing_in_it_changes_any_more(sessions: Path) -> None:
+    with session._session_folder():
+        pass
+    long_ago = time.time() - 2 * DAY_S
+    for name, changed in (("quiet", long_ago), ("alive", time.time())):
+        (sessions / name / "logs").mkdir(parents=True)
+        (sessions / name / "owner").write_text("another-boot~1~1")
+        (sessions / name / "logs/raylet.out").touch()
+        for path in (sessions / name / "logs", sessions / name / "owner", sessions / name):
+            os.utime(path, (long_ago, long_ago))
+        os.utime(sessions / name / "logs/raylet.out", (changed, changed))
+    with session._session_folder() as own:
+        assert sorted(sessions.iterdir()) == sorted([sessions / "alive", own])
 
 
 def test_an_interrupt_while_a_session_starts_leaves_no_process(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:

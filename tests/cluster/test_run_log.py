@@ -1,5 +1,7 @@
 """The run log and the stages: done once, timed over all attempts, whatever a kill leaves."""
 
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,7 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cluster.campaign.campaign import Campaign
+from cluster.runs.run_folder import find
 from cluster.runs.run_log import BEAT_SHARE, RunLog, pause_s
+from tests.support.finished_run import make_finished_run
 from tests.support.synced import Synced
 from tests.support.waiting import wait_until
 
@@ -151,3 +156,20 @@ def test_a_new_log_survives_a_power_cut(tmp_path: Path, monkeypatch: pytest.Monk
     synced = Synced(monkeypatch)
     RunLog(tmp_path / "log.jsonl").note("attempt")
     assert synced.lacks(tmp_path) == [str(tmp_path.parent)]
+
+
+def test_a_run_that_goes_on_removes_what_killed_workers_left_in_a_store_that_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_finished_run(tmp_path / "run", objects=2)
+    code = (
+        "import sys; from shared.store import Store; from shared.store.crash_log import Heartbeat\n"
+        "log = Store.open(sys.argv[1]).crash_log; log.open_fault_log().close()\n"
+        "log.leave(Heartbeat(shard_id='a', rollout=1))"
+    )
+    subprocess.run([sys.executable, "-c", code, str(run.store)], check=True)
+    assert len(list((run.store / "underway").iterdir())) == 2
+    monkeypatch.setattr(RunLog, "run", lambda *_: None)
+    monkeypatch.setattr("cluster.reporting.report.print_report", lambda _: None)
+    Campaign(*find(run.path)).execute()
+    assert list((run.store / "underway").iterdir()) == []

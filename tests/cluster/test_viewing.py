@@ -265,7 +265,7 @@ def test_nothing_is_overwritten_or_saved_in_vain(tmp_path: Path, monkeypatch: py
     with pytest.raises(UsageError, match="cannot be written"):
         marking.save(tmp_path / "absent" / "marked.npz", overwrite=False)
 
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as disk:

@@ -226,7 +226,10 @@ def test_the_commands_say_what_they_did(tmp_path: Path, capsys: pytest.CaptureFi
     assert [said[0]["digest"], said[1]["digest"]] == [digest] * 2
     assert said[0]["after"] == 1
     assert said[2]["splits"]["train"]["interactions"] == 8
-    assert run(["store", "export", str(store.path), "--out", str(tmp_path / "out")]) == 2
+    again = ["store", "export", str(tmp_path / "copy"), "--out", str(tmp_path / "out"), "--json"]
+    assert run(again) == 0
+    assert json.loads(capsys.readouterr().out) == said[2]
+    assert run([*again, "--format", "hf"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
 

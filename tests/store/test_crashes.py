@@ -10,6 +10,7 @@ from shared.io.files import temporary_name
 from shared.plan import Job, Plan, missing_jobs
 from shared.store import Store, verify
 from tests.support.fabricate import fabricate_rollouts, fabricate_setting
+from tests.support.killed_writers import kill_while_writing
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,7 +33,9 @@ def test_a_writer_killed_at_any_step_leaves_a_store_that_finishes_with_the_same_
     assert 1 <= len(done) < steps, "deaths before the rename lose the shard, the last run commits it"
     assert verify(store) == []
 
-    assert store.sweep() > 0, "the dead left something"
+    assert not list(store.path.rglob(".tmp-*")), "each writer removes what the dead left"
+    kill_while_writing(store.path / "shards/random-v0-00000000-00000032")
+    assert store.sweep() == 1
     assert not list(store.path.rglob(".tmp-*"))
     ranges = [(manifest.start, manifest.stop) for manifest in store.committed()]
     for job in missing_jobs(plan.key, steps, ranges, per_shard=32):
@@ -42,6 +45,15 @@ def test_a_writer_killed_at_any_step_leaves_a_store_that_finishes_with_the_same_
     job = Job(plan.key, 0, steps)
     whole.commit(plan, job, fabricate_rollouts(plan, job, 2), {})
     assert store.digest() == whole.digest()
+
+
+def test_a_learner_that_publishes_removes_what_a_killed_one_left(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "store", fabricate_setting())
+    (store.path / "policies").mkdir()
+    kill_while_writing(store.path / "policies/000001")
+    store.publish_policy(1, {"policy.json": b"{}"})
+    assert [path.name for path in (store.path / "policies").glob("[!.]*")] == ["000001"]
+    assert not list(store.path.rglob(".tmp-*"))
 
 
 def test_a_creator_killed_at_any_step_leaves_a_folder_that_can_become_the_store(tmp_path: Path) -> None:

@@ -362,6 +362,21 @@ def test_an_export_that_was_stopped_with_its_notes_in_it_goes_on(
     assert contents(out) == contents(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("name", EXPORT_FORMATS.names())
+def test_a_complete_export_is_left_as_it_is_by_the_same_command_alone(name: str, store: Store, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = export(store, out, SPLITS, format=name)
+    before, times = contents(out), [path.stat().st_mtime_ns for path in sorted(out.rglob("*"))]
+    assert export(store, out, SPLITS, format=name) == done
+    assert [path.stat().st_mtime_ns for path in sorted(out.rglob("*"))] == times
+    others = ((SPLITS, "plain" if name == "hf" else "hf"), ({"train": SPLITS["train"]}, name))
+    for splits, format_ in others:
+        with pytest.raises(UsageError, match="is there already; name a new folder"):
+            export(store, out, splits, format=format_)
+    assert contents(out) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
 def contents(out: Path) -> dict[str, bytes]:
     """All files; Zarr's metadata say nothing of time."""
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}

@@ -61,8 +61,13 @@ def test_an_export_into_a_bucket_goes_on_with_what_is_not_finished(
     assert len(said) - before < before, "pieces that were finished are not written again"
     export(store, tmp_path / "out", SPLITS, format="minari")
     assert objects_of(s3_url) == contents(tmp_path / "out")
-    with pytest.raises(UsageError, match="is there already; name a new prefix"):
-        export(store, s3_url, SPLITS, format="minari")
+    before = len(said)
+    export(store, s3_url, SPLITS, lambda *counts: said.append(counts), format="minari")
+    assert len(said) - before == len(store.parts()), "each shard was looked through, and none was written"
+    for splits, name in ((SPLITS, "hf"), ({"train": SPLITS["train"]}, "minari")):
+        with pytest.raises(UsageError, match="is there already; name a new prefix"):
+            export(store, s3_url, splits, format=name)
+    assert objects_of(s3_url) == contents(tmp_path / "out")
 
 
 def test_an_export_into_a_bucket_begins_anew_where_the_command_is_another(

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -122,6 +123,15 @@ def test_only_what_the_dead_left_is_removed(tmp_path: Path) -> None:
     reused.mkdir()
     assert [files.remove_if_abandoned(path) for path in (left, ours, other, reused)] == [True, False, False, True]
     assert sorted(tmp_path.iterdir()) == sorted([ours, other])
+
+
+@pytest.mark.parametrize("write", [files.write_atomically, files.create_exclusively])
+def test_what_a_killed_writer_left_goes_when_a_process_first_writes_beside_it(
+    write: Callable[[Path, bytes], object], tmp_path: Path
+) -> None:
+    kill_while_writing(tmp_path / "sheet.png")
+    write(tmp_path / "other.png", b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["other.png"]
 
 
 def test_what_the_dead_left_and_cannot_be_removed_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import tyro
 from pydantic import Field
 
 from adaafford.recordings import WHOLE, Selection
-from cluster.config.flags import parse_flags
+from cluster.config.flags import OutFile, parse_flags
 from shared.errors import AdaAffordError, UsageError
 from shared.io.text import plain
 from shared.types import OutcomeKind
@@ -44,7 +44,7 @@ class AdaptCommand:
     policy: str | None = None
     """The name of a bundled policy, a folder with weights.safetensors and policy.json, or a finished run. Without
     it, the bundled ones are listed."""
-    out: Path | None = None
+    out: OutFile | None = None
     """File for the adapted affordance: .ply, .npz or .html; default: heatmap.ply beside the history."""
     part: str | None = None
     """Of raw scans, with the object's surroundings: the part to act on: auto (the most confident), the number of one
@@ -105,10 +105,6 @@ def main(args: list[str]) -> int:
         )
     if command.budget < 1:
         raise UsageError(f"--budget {command.budget}: at least one interaction is needed to adapt")
-    if command.out is not None and not command.out.parent.is_dir():
-        raise UsageError(
-            f"--out {command.out}: there is no folder {command.out.parent}; create it, or name another place"
-        )
     if not MIN_SHOWN <= command.points <= MAX_SHOWN:
         raise UsageError(f"--points {command.points}: allowed are {MIN_SHOWN} to {MAX_SHOWN}")
     if command.arm is None and any(command.base):

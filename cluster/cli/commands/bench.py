@@ -18,7 +18,7 @@ import tyro
 from pydantic import Field
 
 from cluster.config.command_settings import ObjectSelection
-from cluster.config.flags import dispatch
+from cluster.config.flags import OutFolder, dispatch
 from shared.config import FIDELITIES, CollectionConfig, Fidelity, FidelityVersion
 from shared.formatting import finite
 from shared.io.files import scratch_folder, write_atomically, writing
@@ -45,7 +45,7 @@ class BenchSettings(ObjectSelection):
     """Built-in objects: how many of each category that the task applies to."""
     as_json: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(name="json")] = False
     """Print one JSON object as the last line."""
-    out: Path | None = None
+    out: OutFolder | None = None
     """A folder that also gets the result as a file, with date, hardware and versions."""
     collection: CollectionConfig = CollectionConfig()
 

@@ -2,12 +2,11 @@
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from cluster.config.flags import parse_flags
+from cluster.config.flags import OutFolder, parse_flags
 from shared.errors import UsageError
 
 
@@ -23,7 +22,7 @@ class CalibrateCommand:
     """A name of those that the package brings, a folder with weights.safetensors and policy.json, or a finished run."""
     store: tuple[str, ...]
     """Folders or s3:// URLs of stores with interactions on your objects; they are only read."""
-    out: Path
+    out: OutFolder
     """Folder to write the policy to; files of an earlier export are replaced, and nothing else may lie there."""
     fit: Literal["scale", "last-layer"] = "scale"
     """What is fitted of each critic. "scale": a temperature and a bias; "last-layer": all weights of its last layer."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from cluster.config.flags import parse_flags
+from cluster.config.flags import OutFolder, parse_flags
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class CompareCommand:
     evaluation: str | None = None
     """Prefix of a folder in each RUN/evaluations, which `adaafford evaluate` made; default: the final evaluation of
     each run."""
-    out: Path | None = None
+    out: OutFolder | None = None
     """A folder for comparison.md, comparison.png, comparison.csv and comparison.json."""
 
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from cluster.config.flags import parse_flags
+from cluster.config.flags import OutFolder, parse_flags
 from shared.errors import UsageError
-from shared.io.files import make_folder
 
 if TYPE_CHECKING:
     from cluster.evaluation.curves import Curves
@@ -27,7 +26,7 @@ class CurveCommand:
     runs: tuple[str, ...]
     """NAME=RUN ...: the --out of `train alternate`, aap or aip. Runs with the same name are seeds of one training. A
     run without an oracle is compared with the oracle of the run at the same position of another name."""
-    out: Path | None = None
+    out: OutFolder | None = None
     """A folder for curve.md, curve.csv, curve.png and curve.json."""
     tries: tuple[int, ...] = (0, 1, 2, 4)
     """Numbers of interactions."""
@@ -52,8 +51,6 @@ def main(args: list[str]) -> int:
         raise UsageError(f"--seed {command.seed}: give a number of 0 or more")
     if command.threads is not None and not 1 <= command.threads <= 1024:
         raise UsageError(f"--threads {command.threads}: give a number from 1 to 1024")
-    if command.out is not None:
-        make_folder(command.out)
     curves = _judge(command, named_runs(command.runs))
     from cluster.evaluation.curves import as_json, as_markdown, write_curves
 

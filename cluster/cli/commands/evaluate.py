@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from cluster.config.command_settings import EvaluateSettings
-from cluster.config.flags import parse_flags
+from cluster.config.flags import OutFolder, parse_flags
 from shared.errors import UsageError
 from shared.policies.methods import METHODS
 
@@ -24,7 +24,7 @@ class EvaluateCommand:
     """Folder of a run that has published a policy."""
     policy: str | None = None
     """Instead of a run: a name of the policies that the package brings, a folder with policy.json, or a file there."""
-    out: Path | None = None
+    out: OutFolder | None = None
     """Folder for the trials and the table; default: one named after the settings, in RUN/evaluations or, without a run,
     in evaluations/ of the working folder."""
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from cluster.config.flags import parse_flags
+from cluster.config.flags import OutFolder, parse_flags
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,7 +15,7 @@ class ExportPolicyCommand:
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of a run, or --out of an `adaafford train`; the latter needs --store."""
-    out: Path
+    out: OutFolder
     """Folder to write to; files of an earlier export are replaced; other files are not allowed."""
     policy: int | None = None
     """Version of a run's policy; default: the last."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from pydantic import Field
 
-from cluster.config.flags import Action, dispatch
+from cluster.config.flags import Action, OutFile, OutFolder, dispatch
 from shared.config import PANDA
 from shared.errors import UsageError
 from shared.formatting import counted
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class GenerateCommand:
     """Make built-in procedural objects in PartNet-Mobility's layout."""
 
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[OutFolder, tyro.conf.Positional]
     """Folder of the objects; existing ones are kept."""
     per_category: Annotated[int, Field(ge=1)] = 4
     """Objects of each category."""
@@ -40,7 +40,7 @@ class ImportCommand:
 
     source: Annotated[Path, tyro.conf.Positional]
     """A .urdf or MJCF .xml file, or an object's folder."""
-    out: Path
+    out: OutFolder
     """Folder of objects; the object becomes a folder in it, and ID.png beside it shows it before and after."""
     id: str | None = None
     """What the object is called; the name of its file or folder unless given."""
@@ -73,7 +73,7 @@ class ExportCommand:
 
     path: Annotated[Path, tyro.conf.Positional]
     """One object's folder, or a folder of objects."""
-    out: Path
+    out: OutFolder
     """Folder; each object becomes a folder in it."""
     format: Literal["urdf", "mjcf"] = "urdf"
     """Of the main file, which is called mobility.urdf or object.xml."""
@@ -105,7 +105,7 @@ class PreviewCommand:
 
     path: Annotated[Path, tyro.conf.Positional]
     """A folder of objects, or one object's folder."""
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[OutFile, tyro.conf.Positional]
     """The picture, a PNG."""
     most: int = 100
     """The most objects to draw."""
@@ -117,7 +117,7 @@ class FilmCommand:
 
     path: Annotated[Path, tyro.conf.Positional]
     """One object's folder, or a folder of objects, whose first usable one is taken."""
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[OutFile, tyro.conf.Positional]
     """The picture, a PNG."""
     primitives: tuple[str, ...] = ()
     """Only these primitives; default: all."""
@@ -144,7 +144,7 @@ class ScenesCommand:
 
     path: Annotated[Path, tyro.conf.Positional]
     """A folder of objects."""
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[OutFolder, tyro.conf.Positional]
     """Folder of the scenes: new, or of the same settings."""
     count: Annotated[int, Field(ge=1, le=100_000)] = 1500
     """Number of scenes; each object in turn, in a random order."""

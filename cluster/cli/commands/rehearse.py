@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from pydantic import Field
 
-from cluster.config.flags import parse_flags
+from cluster.config.flags import OutFolder, parse_flags
 from shared.config import MAX_NOISE, PANDA
 from shared.errors import UsageError
 from shared.extras import require
@@ -36,7 +36,7 @@ class RehearseCommand:
     policy is in this process, and the result is printed. The same command goes on after an interruption.
     """
 
-    folder: Annotated[Path, tyro.conf.Positional]
+    folder: Annotated[OutFolder, tyro.conf.Positional]
     """Folder for scans, state and, with --policy, history and heatmap; created if missing."""
     task: str
     """A task by name, or a TOML file that defines one."""

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from cluster.config.campaign_config import CampaignConfig
-from cluster.config.flags import early_flags, layered, parse_flags
+from cluster.config.flags import OutFolder, early_flags, layered, parse_flags
 from shared.errors import UsageError
 from shared.policies.methods import METHODS
 
@@ -20,7 +20,7 @@ class RunCommand:
     """
 
     settings: Annotated[CampaignConfig, tyro.conf.arg(name="")]
-    out: Path | None = None
+    out: OutFolder | None = None
     """Folder of the run: new, empty, or of the same run. A dry run needs none."""
     preset: str = "smoke"
     """A set of settings: smoke, laptop or paper."""

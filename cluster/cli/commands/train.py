@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import tyro
 from pydantic import Field
 
-from cluster.config.flags import early_flags, layered, parse_flags
+from cluster.config.flags import OutFolder, early_flags, layered, parse_flags
 from learner.settings import LearnerConfig, SegmentationConfig
 from shared.errors import UsageError
 from shared.policies.methods import BASELINES
@@ -39,7 +39,7 @@ class LearnerCommand:
     settings: Annotated[LearnerConfig, tyro.conf.arg(name="")]
     store: str
     """Folder or s3:// URL of the store."""
-    out: Path
+    out: OutFolder
     """Folder for policies, metrics and checkpoints: new, or of the same training."""
     train_objects: Path | None = None
     """A text file with the ids of the objects to learn from, one a line."""
@@ -74,7 +74,7 @@ class SegmentationCommand:
 
     scenes: Path
     """Folder that `adaafford objects scenes` made."""
-    out: Path
+    out: OutFolder
     """Folder for the network, its metrics and its checkpoint: new, or of the same training."""
     settings: Annotated[SegmentationConfig, tyro.conf.arg(name="")] = SegmentationConfig()
     seed: Annotated[int, Field(ge=0)] = 0

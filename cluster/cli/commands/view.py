@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from adaafford.recordings import WHOLE, Selection, is_recording
-from cluster.config.flags import parse_flags
+from cluster.config.flags import OutFile, parse_flags
 from shared.errors import UsageError
 from shared.io.text import plain
 
@@ -42,7 +42,7 @@ class ViewCommand:
     """Folder of the store's objects, for the simulation. Default: the run's, or the procedural ones of the store."""
     port: int = 8080
     """Of 127.0.0.1; 0: a free one. From another machine: ssh -L 8080:127.0.0.1:8080 HOST."""
-    out: Path | None = None
+    out: OutFile | None = None
     """The file that the marks of a scan are saved to (.npz). Default: SCAN-marked.npz beside the scan."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
     """Replace that file if it is there."""
@@ -59,11 +59,11 @@ def main(args: list[str]) -> int:
     with viewing(command) as server:
         port = server.get_port()
         # An exception in the middle of printing would have the line printed twice.
-        signal.signal(signal.SIGINT, lambda *_: ended.set())
+        before = signal.signal(signal.SIGINT, lambda *_: ended.set())
         print(f"http://127.0.0.1:{port} shows it, on this machine only; Ctrl-C ends the viewer")
         print(f"from another machine: ssh -L {port}:127.0.0.1:{port} HOST, then the same address", flush=True)
         ended.wait()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, before)
     print("the viewer has ended")
     return 0
 

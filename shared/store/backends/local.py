@@ -14,6 +14,7 @@ from shared.io.files import (
     exclusive_lock,
     read_bounded,
     remove_if_abandoned,
+    remove_remnants_once,
     remove_tree,
     sync_folder,
     temporary_name,
@@ -103,6 +104,7 @@ class LocalBackend(StorageBackend):
     def publish(self, transaction: Transaction) -> bool:
         final = self._at(transaction.folder)
         final.parent.mkdir(exist_ok=True)
+        remove_remnants_once(final.parent)
         temporary = final.parent / temporary_name(final.name)
         try:
             _write_files(temporary, transaction.files, transaction.mark, transaction.describe(transaction.files))

@@ -2,7 +2,7 @@
 
 Until all is there, a disk has it as OUT.unfinished, and in both there are notes:
 
-.export/begun.json      what is exported
+.export/begun.json      the identity of what is exported, which a complete export has in its croissant.json
 .export/<n>.json        of each finished piece, its files and its summary
 """
 
@@ -27,12 +27,14 @@ from shared.io.files import (
     sync_tree,
     write_atomically,
 )
-from shared.store.backends.base import backend_of, is_url
+from shared.store.backends.base import StorageBackend, backend_of, is_url
 from shared.store.layout import MAX_DOCUMENT_BYTES
 from shared.store.presence import present
 
 UNFINISHED = ".unfinished"
 NOTES, BEGUN = ".export", "begun.json"
+CROISSANT, IDENTIFIER = "croissant.json", "identifier"
+"""The file of a complete export, and its entry, that say what was exported."""
 _PIECE = "piece"
 _GO_ON = "repeat the command to go on"
 
@@ -47,11 +49,15 @@ class Destination(Protocol):
 
     folder: Path
 
-    def begin(self, identity: dict[str, Any]) -> AbstractContextManager[None]:
+    def is_complete(self, identity: str) -> bool:
+        """Whether the complete export of this identity is there; notes that are left of it are removed."""
+        ...
+
+    def begin(self, identity: str) -> AbstractContextManager[None]:
         """Hold the place: with what an export of the same identity left there, or empty.
 
         Raises:
-            UsageError: another process holds it, or it holds something that is no unfinished export.
+            UsageError: another process holds it, or it holds something that is no unfinished export of the identity.
             OSError: it cannot be written.
         """
         ...
@@ -89,7 +95,7 @@ def destination(out: str | Path) -> Destination:
     """The place of this name.
 
     Raises:
-        UsageError: it is there already, or its URL is not allowed.
+        UsageError: it holds something that is no export, or its URL is not allowed.
     """
     if is_url(out):
         return BucketDestination(str(out))
@@ -101,20 +107,24 @@ class DiskDestination(Destination):
     """A folder of a disk."""
 
     def __init__(self, out: Path) -> None:
-        if os.path.lexists(out) and not (out / NOTES / BEGUN).is_file():
+        if os.path.lexists(out) and not (out / CROISSANT).is_file():
             raise _there_already(out)
         self._out = out
         self.folder = out.with_name(out.name + UNFINISHED)
         self._notes = self.folder / NOTES
 
+    def is_complete(self, identity: str) -> bool:
+        if _identifier(_note(self._out / CROISSANT)) != identity:
+            return False
+        # It was killed after it had its name, and before its notes were gone.
+        remove_tree(self._out / NOTES)
+        return True
+
     @contextmanager
-    def begin(self, identity: dict[str, Any]) -> Iterator[None]:
+    def begin(self, identity: str) -> Iterator[None]:
         folder, notes = self.folder, self._notes
         if os.path.lexists(self._out):
-            # It was killed after it had its name, and before its notes were gone.
-            if _note(self._out / NOTES / BEGUN) != identity:
-                raise _there_already(self._out)
-            self._out.rename(folder)
+            raise _there_already(self._out)
         folder.mkdir(parents=True, exist_ok=True)
         if not notes.is_dir() and any(folder.iterdir()):
             raise UsageError(
@@ -124,12 +134,12 @@ class DiskDestination(Destination):
         with exclusive_lock(notes / DRIVER_LOCK):
             for written in (folder, notes):
                 remove_remnants(written)
-            if self.note(BEGUN) != identity:
+            if _identifier(self.note(BEGUN)) != identity:
                 # Begun by another command, or before the store had grown.
                 for path in [*folder.iterdir(), *notes.iterdir()]:
                     if path not in (notes, notes / DRIVER_LOCK):
                         remove_tree(path)
-                self.add_note(BEGUN, identity)
+                self.add_note(BEGUN, {IDENTIFIER: identity})
             yield
 
     def note(self, name: str) -> dict[str, Any] | None:
@@ -179,28 +189,28 @@ class BucketDestination(Destination):
         self._backend, self._notes = S3Backend.of(self._out), S3Backend.of(f"{self._out}/{NOTES}")
         self._taken = set[str]()
         there = set(self._backend.names(""))
-        if there - {NOTES} and not self._notes.exists(BEGUN):
-            raise UsageError(f"{out}: is there already; name a new prefix")
+        if there - {NOTES} and not self._notes.exists(BEGUN) and CROISSANT not in there:
+            raise self._there_already()
+
+    def is_complete(self, identity: str) -> bool:
+        return not self._notes.exists(BEGUN) and _identifier(_read(self._backend, CROISSANT)) == identity
 
     @contextmanager
-    def begin(self, identity: dict[str, Any]) -> Iterator[None]:
+    def begin(self, identity: str) -> Iterator[None]:
+        if not self._notes.exists(BEGUN) and self._backend.exists(CROISSANT):
+            raise self._there_already()
         with scratch_folder("export") as staging, present(self._notes, "export", alone=True):
             self._staging, self.folder = staging, staging / "out"
             self.folder.mkdir()
-            if self.note(BEGUN) != identity:
+            if _identifier(self.note(BEGUN)) != identity:
                 for key in self._backend.leaves(""):
                     if not key.startswith(f"{NOTES}/status/"):
                         self._backend.remove(key)
-                self.add_note(BEGUN, identity)
+                self.add_note(BEGUN, {IDENTIFIER: identity})
             yield
 
     def note(self, name: str) -> dict[str, Any] | None:
-        try:
-            return parse_object(self._notes.read(name, MAX_DOCUMENT_BYTES), f"{self._notes.where}/{name}")
-        except UnreadableError:
-            raise
-        except StoreError:
-            return None
+        return _read(self._notes, name)
 
     def add_note(self, name: str, note: Mapping[str, Any]) -> None:
         with _going_on():
@@ -243,6 +253,9 @@ class BucketDestination(Destination):
             f"what is finished is in the bucket: {_GO_ON}"
         )
 
+    def _there_already(self) -> UsageError:
+        return UsageError(f"{self._out}: is there already; name a new prefix")
+
     def _upload(self, name: str, path: Path) -> None:
         with _going_on():
             self._backend.upload(name, path)
@@ -275,6 +288,20 @@ def _note(path: Path) -> dict[str, Any] | None:
         return parse_object(read_bounded(path, MAX_DOCUMENT_BYTES), str(path))
     except StoreError:
         return None
+
+
+def _read(backend: StorageBackend, name: str) -> dict[str, Any] | None:
+    """A note in a bucket; None where it is missing or was damaged."""
+    try:
+        return parse_object(backend.read(name, MAX_DOCUMENT_BYTES), f"{backend.where}/{name}")
+    except UnreadableError:
+        raise
+    except StoreError:
+        return None
+
+
+def _identifier(note: Mapping[str, Any] | None) -> object:
+    return None if note is None else note.get(IDENTIFIER)
 
 
 def _emptied(folder: Path) -> Path:

@@ -27,7 +27,7 @@ from shared.io.text import MAX_WORD, plain
 from shared.seeds import generator
 from shared.store.backends.base import is_url
 from shared.store.maintenance.datacard import SplitFigures, croissant, data_card
-from shared.store.maintenance.destinations import NOTES, Destination, destination
+from shared.store.maintenance.destinations import CROISSANT, IDENTIFIER, NOTES, Destination, destination
 from shared.store.maintenance.formats import EXPORT_FORMATS, PLAIN, ExportFormat
 from shared.store.maintenance.steps import Content, Splits, survey
 from shared.store.store import Store
@@ -74,6 +74,8 @@ def export(
 ) -> Export:
     """Write a store as plain files; `out` is there when all of it is. After a kill or on a full disk, the same goes on.
 
+    A complete export of the same content is left as it is.
+
     Args:
         store: what is written.
         out: a folder that is not there yet, or s3://BUCKET/PREFIX with nothing below it.
@@ -84,8 +86,8 @@ def export(
         push: "USER/NAME" of a data set on the Hugging Face Hub, where the files are put, too, before `out` is there.
 
     Raises:
-        UsageError: no such format; the place is there, or cannot be written; or an object is in two splits, or
-            in no store; or the Hub refuses.
+        UsageError: no such format; something else is at the place, or it cannot be written; or an object is in two
+            splits, or in no store; or the Hub refuses.
         StoreError: the store is damaged, or a split comes out empty.
     """
     chosen = EXPORT_FORMATS.get(format)
@@ -96,14 +98,19 @@ def export(
     say = progress or (lambda done, total: None)
     deliver = pusher(push, NOTES) if push else None
     content = survey(store, splits, say)
+    identity = _identity(content, chosen)
     try:
-        with place.begin(_identity(content, chosen)):
+        if place.is_complete(identity):
+            if deliver is not None:
+                deliver(Path(out))
+            return Export(str(out), dict(content.figures))
+        with place.begin(identity):
             receipts = list(_pieces(content, chosen, place, say))
             folder = place.folder
             chosen.finish(content, folder, [receipt["summary"] for receipt in receipts])
             write_atomically(folder / "setting.json", _json(store.setting.as_document()))
             write_atomically(folder / "README.md", data_card(content, chosen).encode())
-            write_atomically(folder / "croissant.json", _json(croissant(content, chosen)))
+            write_atomically(folder / CROISSANT, _json(croissant(content, chosen) | {IDENTIFIER: identity}))
             if deliver is not None:
                 deliver(folder)
             place.complete()
@@ -112,11 +119,11 @@ def export(
     return Export(str(out), dict(content.figures))
 
 
-def _identity(content: Content, chosen: ExportFormat) -> dict[str, Any]:
+def _identity(content: Content, chosen: ExportFormat) -> str:
     """What an export that goes on must have in common with the one that was begun."""
     pieces = [str(piece) for piece in content.pieces(chosen.piece_bytes)]
     told = [content.digest, str(content.schema), pieces, {name: sorted(each) for name, each in content.splits.items()}]
-    return {"format": chosen.name, "content": hashlib.sha256(json.dumps(told).encode()).hexdigest()}
+    return f"{chosen.name}:{hashlib.sha256(json.dumps(told).encode()).hexdigest()}"
 
 
 def _pieces(content: Content, chosen: ExportFormat, place: Destination, progress: Progress) -> Iterator[dict[str, Any]]:
