@@ -15,6 +15,7 @@ from packaging.utils import canonicalize_name
 
 import shared.extras as extras_module
 from cluster.cli.main import COMMANDS, NEEDS, run
+from cluster.workers.ray_process import SLOW
 from shared.extras import EXTRAS, extra_of
 from tests.support.as_toml import as_toml
 from tests.support.small_trainings import FAST, make_store
@@ -37,6 +38,13 @@ def test_every_supported_python_is_named() -> None:
     named = {line.rpartition(" ")[2] for line in PROJECT["classifiers"] if "Python :: 3." in line}
     assert named == set(PYTHONS)
     assert PROJECT["requires-python"] == ">=3.11,<3.15"
+
+
+def test_no_extra_brings_what_makes_the_import_of_ray_slow() -> None:
+    lines = (ROOT / "requirements.lock").read_text().splitlines()
+    locked = {canonicalize_name(line.partition("==")[0]) for line in lines if line[:1].isalnum()}
+    assert "ray" in locked
+    assert not locked & set(map(canonicalize_name, SLOW))
 
 
 @pytest.mark.parametrize(
