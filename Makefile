@@ -40,8 +40,8 @@ sbom: $(STAMP)  ## List what is installed, with versions and licences, into buil
 	  build/cyclonedx/bin/pip install --quiet -c constraints.txt cyclonedx-bom; }
 	build/cyclonedx/bin/cyclonedx-py environment --output-reproducible --output-file build/sbom.json $(BIN)/python
 
-chaos: $(STAMP)  ## Kill campaigns at random moments and disturb every write step, about half an hour; SEED=N for others.
-	$(if $(SEED),ADAAFFORD_CHAOS_SEED=$(SEED)) $(BIN)/python -m pytest -q -m chaos
+chaos: $(STAMP)  ## Kill campaigns at random moments and disturb every write step, in two processes; SEED=N for other moments.
+	$(if $(SEED),ADAAFFORD_CHAOS_SEED=$(SEED)) $(BIN)/python -m pytest -q -m chaos -n 2 --dist worksteal tests/chaos
 
 check: $(STAMP)  ## Lint, formatting, types, import directions.
 	$(BIN)/ruff check .

@@ -3,7 +3,7 @@
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,17 +17,26 @@ SEED_VARIABLE = "ADAAFFORD_CHAOS_SEED"
 LIMIT_S = 2700
 """Against what hangs; on a busy machine a test takes many times its usual minute or two."""
 
-COUNTS = Counts()
+COUNTS = "chaos counts"
+"""The property of a test's report that holds what it counted."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("chaos") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(LIMIT_S))
+    # The shortest come last, so that of two processes neither waits long for the other.
+    items.sort(key=lambda item: item.path.name == "test_every_step.py")
 
 
-def pytest_terminal_summary() -> None:
-    COUNTS.print(_seed())
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    all_counts = Counts()
+    for report in (report for reports in terminalreporter.stats.values() for report in reports):
+        if isinstance(report, pytest.TestReport) and report.when == "teardown":
+            for name, value in report.user_properties:
+                if name == COUNTS:
+                    all_counts.add(str(value))
+    all_counts.print(_seed())
 
 
 def _seed() -> int:
@@ -40,8 +49,10 @@ def seed() -> int:
 
 
 @pytest.fixture
-def counts() -> Counts:
-    return COUNTS
+def counts(record_property: Callable[[str, object], None]) -> Iterator[Counts]:
+    counts = Counts()
+    yield counts
+    record_property(COUNTS, counts.as_json())
 
 
 @pytest.fixture(scope="session")
