@@ -17,6 +17,9 @@ SEED_VARIABLE = "ADAAFFORD_CHAOS_SEED"
 LIMIT_S = 2700
 """Against what hangs; on a busy machine a test takes many times its usual minute or two."""
 
+HERE = Path(__file__).parent
+LONGEST_FIRST = ("test_learning.py", "test_collecting.py", "test_two_drivers.py", "test_every_step.py")
+
 COUNTS = "chaos counts"
 """The property of a test's report that holds what it counted."""
 
@@ -25,8 +28,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("chaos") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(LIMIT_S))
-    # The shortest come last, so that of two processes neither waits long for the other.
-    items.sort(key=lambda item: item.path.name == "test_every_step.py")
+    ours = sorted((item for item in items if item.path.parent == HERE), key=_rank)
+    # A process is given one half, and what the other has not begun when it is done: short tests end both halves.
+    items[:] = [item for item in items if item.path.parent != HERE] + ours[::2] + ours[1::2]
+
+
+def _rank(item: pytest.Item) -> int:
+    """The place of its file in `LONGEST_FIRST`."""
+    return LONGEST_FIRST.index(item.path.name) if item.path.name in LONGEST_FIRST else len(LONGEST_FIRST)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
