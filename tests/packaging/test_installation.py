@@ -150,7 +150,7 @@ def test_the_core_adapts_and_trains_in_an_empty_environment(tmp_path: Path) -> N
     (wheel,) = tmp_path.glob("adaafford-*.whl")
     call(sys.executable, "-m", "venv", "new")
     python, adaafford = tmp_path / "new" / "bin" / "python", tmp_path / "new" / "bin" / "adaafford"
-    call(python, "-m", "pip", "install", "--quiet", "--constraint", ROOT / "constraints.txt", wheel)
+    call(python, "-m", "pip", "install", "--quiet", "--no-compile", "--constraint", ROOT / "constraints.txt", wheel)
     for package in ("ray", "sapien", "matplotlib", "plotly"):
         done = subprocess.run([python, "-c", f"import {package}"], capture_output=True, text=True, check=False)
         assert f"No module named '{package}'" in done.stderr
