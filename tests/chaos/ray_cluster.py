@@ -16,7 +16,8 @@ from tests.chaos.processes import Marked, Role
 NODES = 2
 START = ("from ray.scripts.scripts import main; main()", "start", "--disable-usage-stats")
 START_LIMIT_S = 300.0
-PORTS = ("--min-worker-port=0", "--max-worker-port=0", f"--object-store-memory={80_000_000}")
+NODE = ("--min-worker-port=0", "--max-worker-port=0", "--include-log-monitor=false", "--object-store-memory=80000000")
+"""Nobody reads what log monitors send to drivers."""
 
 
 class RayCluster:
@@ -59,7 +60,7 @@ class RayCluster:
         """Start a node; a busy machine may need several attempts, and `before` is called before each."""
         log = self._folder / "log.txt"
         deadline = time.monotonic() + START_LIMIT_S
-        command = [sys.executable, "-c", *START, *arguments, *PORTS]
+        command = [sys.executable, "-c", *START, *arguments, *NODE]
         before()
         while self.marked.execute(command, log).wait(START_LIMIT_S) != 0:
             assert time.monotonic() < deadline, log.read_text()[-3000:]
