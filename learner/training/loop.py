@@ -23,6 +23,7 @@ from learner.settings import METRICS_FILE, TrainingConfig
 from learner.training import data_parallel
 from learner.training.checkpoint import Cursor, check_fingerprint, read_checkpoint, read_cursor, write_checkpoint
 from learner.training.hardware import Hardware
+from learner.training.optimiser import Adam
 from learner.training.trackers import Trackers
 from shared.errors import UsageError
 from shared.formatting import finite
@@ -142,7 +143,7 @@ class _Loop:
         if config.seconds is not None and data_parallel.processes() > 1:
             raise UsageError("'seconds' is for one process, since clocks differ; give 'steps' alone to several")
         self.groups = [group for group in stage.parameter_groups() if group.parameters]
-        self.optimiser = torch.optim.Adam(
+        self.optimiser = Adam(
             [{"params": list(group.parameters)} for group in self.groups],
             lr=config.learning_rate,
             weight_decay=config.weight_decay,

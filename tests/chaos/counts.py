@@ -1,8 +1,10 @@
-"""What was done to campaigns and commits, counted, and printed when all is over."""
+"""What was done to campaigns and commits, counted by each test, and printed when all is over."""
 
+import json
 from collections import Counter
 from dataclasses import dataclass, field
 from threading import Lock
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -35,6 +37,18 @@ class Counts:
         """Count write steps, at each of which a commit was disturbed."""
         with self.lock:
             self.steps[place, fault] += steps
+
+    def as_json(self) -> str:
+        """All counts as text, which a process of pytest hands to the one that prints."""
+        counters: tuple[Counter[Any], ...] = (self.kills, self.campaigns, self.steps)
+        return json.dumps([list(counter.items()) for counter in counters])
+
+    def add(self, text: str) -> None:
+        """Add what `as_json` returned elsewhere."""
+        kills, campaigns, steps = json.loads(text)
+        self.kills.update({(name, Role(role)): count for (name, role), count in kills})
+        self.campaigns.update(dict(campaigns))
+        self.steps.update({(place, fault): count for (place, fault), count in steps})
 
     def print(self, seed: int) -> None:
         """Print all counts."""

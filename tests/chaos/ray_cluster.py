@@ -1,11 +1,13 @@
 """A Ray cluster on this machine that outlives drivers: a head without CPUs, and two nodes that may go and come."""
 
+import random
 import shutil
 import socket
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from tests.chaos.killer import end
@@ -13,7 +15,9 @@ from tests.chaos.processes import Marked, Role
 
 NODES = 2
 START = ("from ray.scripts.scripts import main; main()", "start", "--disable-usage-stats")
-PORTS = ("--min-worker-port=0", "--max-worker-port=0", f"--object-store-memory={80_000_000}")
+START_LIMIT_S = 300.0
+NODE = ("--min-worker-port=0", "--max-worker-port=0", "--include-log-monitor=false", "--object-store-memory=80000000")
+"""Nobody reads what log monitors send to drivers."""
 
 
 class RayCluster:
@@ -26,19 +30,18 @@ class RayCluster:
     def __init__(self, environment: Mapping[str, str]) -> None:
         # Not within a test's folder: the paths of Ray's sockets may have no more than 107 letters.
         self._folder = Path(tempfile.mkdtemp(prefix="ada", dir="/tmp"))
-        with socket.socket() as free:
-            free.bind(("", 0))
-            port = free.getsockname()[1]
-        self.address = f"127.0.0.1:{port}"
-        self._port = port
+        self._port = free_port()
+        self.address = f"127.0.0.1:{self._port}"
         token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0123456789abcdef" * 2}
         self.marked = Marked({**environment, **token}, outlives=True)
 
     def mend(self, role: Role | None = None) -> None:
         """Start what is missing, after something in this role was killed."""
         if not self.marked.in_role(Role.HEAD):
-            self.close_all()
-            self._start("--head", f"--port={self._port}", "--num-cpus=0", f"--temp-dir={self._folder}/ray")
+            head = ["--head", f"--port={self._port}", f"--ray-client-server-port={free_port()}", "--num-cpus=0"]
+            head += [f"--temp-dir={self._folder}/ray", "--include-dashboard=false"]
+            # What is left of a head, also of one that did not come up in time, holds the port.
+            self._start(*head, before=self.close_all)
         for _ in range(NODES - len(self.marked.in_role(Role.RAYLET))):
             self._start(f"--address={self.address}", "--num-cpus=1")
 
@@ -53,10 +56,21 @@ class RayCluster:
         self.close_all()
         shutil.rmtree(self._folder)
 
-    def _start(self, *arguments: str) -> None:
+    def _start(self, *arguments: str, before: Callable[[], None] = lambda: None) -> None:
+        """Start a node; a busy machine may need several attempts, and `before` is called before each."""
         log = self._folder / "log.txt"
-        deadline = time.monotonic() + 100
-        dashboard = ["--include-dashboard=false"] if "--head" in arguments else []
-        command = [sys.executable, "-c", *START, *arguments, *PORTS, *dashboard]
-        while self.marked.execute(command, log).wait(100) != 0:
+        deadline = time.monotonic() + START_LIMIT_S
+        command = [sys.executable, "-c", *START, *arguments, *NODE]
+        before()
+        while self.marked.execute(command, log).wait(START_LIMIT_S) != 0:
             assert time.monotonic() < deadline, log.read_text()[-3000:]
+            before()
+
+
+def free_port() -> int:
+    """A port that nobody listens on, below those that the system gives to programs that ask for any."""
+    while True:
+        with socket.socket() as free, suppress(OSError):
+            port = random.randrange(20_000, 30_000)
+            free.bind(("", port))
+            return port

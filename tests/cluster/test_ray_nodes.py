@@ -93,6 +93,7 @@ def ray_node(machine: Machine, head: Machine, scratch: Path) -> None:
         "--num-cpus=1",
         f"--temp-dir={scratch / machine.address}",
         f"--object-store-memory={80 << 20}",
+        "--include-log-monitor=false",
         "--disable-usage-stats",
         "--block",
     ]

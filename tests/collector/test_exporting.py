@@ -22,6 +22,7 @@ from collector.sim.scene import Scene
 from shared.config import Fidelity
 from shared.primitives import PRIMITIVES
 from shared.types import HiddenDynamics
+from tests.support.environments import environment, install
 
 READERS = Path(__file__).parents[1] / "support" / "foreign_readers.py"
 PACKAGES = ("mujoco", "yourdfpy")
@@ -145,25 +146,19 @@ def test_the_command_exports_every_usable_object(
 
 
 @pytest.fixture(scope="module")
-def foreign_python(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A Python that has the other programs: this one, or that of an environment of its own."""
+def foreign_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Python that has the other programs: this one, or that of another environment."""
     if all(find_spec(name) for name in PACKAGES):
-        return sys.executable
-    folder = tmp_path_factory.mktemp("environment")
-    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
-    python = str(folder / "bin/python")
-    done = subprocess.run(
-        [python, "-m", "pip", "install", "--quiet", *PACKAGES], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        pytest.skip("no package index can be reached")
+        return Path(sys.executable)
+    python = environment(tmp_path_factory.mktemp("environment"))
+    install(python, *PACKAGES)
     return python
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_mujoco_and_yourdfpy_find_the_same_joints_and_pieces(
-    target: ArticulatedObject, tmp_path: Path, foreign_python: str
+    target: ArticulatedObject, tmp_path: Path, foreign_python: Path
 ) -> None:
     files = [exported(target, name, tmp_path / name) for name in MAIN_FILES]
     done = subprocess.run([foreign_python, str(READERS), *map(str, files)], capture_output=True, text=True, check=False)

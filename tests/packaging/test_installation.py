@@ -15,6 +15,7 @@ from packaging.utils import canonicalize_name
 
 import shared.extras as extras_module
 from cluster.cli.main import COMMANDS, NEEDS, run
+from cluster.workers.ray_process import SLOW
 from shared.extras import EXTRAS, extra_of
 from tests.support.as_toml import as_toml
 from tests.support.small_trainings import FAST, make_store
@@ -37,6 +38,13 @@ def test_every_supported_python_is_named() -> None:
     named = {line.rpartition(" ")[2] for line in PROJECT["classifiers"] if "Python :: 3." in line}
     assert named == set(PYTHONS)
     assert PROJECT["requires-python"] == ">=3.11,<3.15"
+
+
+def test_no_extra_brings_what_makes_the_import_of_ray_slow() -> None:
+    lines = (ROOT / "requirements.lock").read_text().splitlines()
+    locked = {canonicalize_name(line.partition("==")[0]) for line in lines if line[:1].isalnum()}
+    assert "ray" in locked
+    assert not locked & set(map(canonicalize_name, SLOW))
 
 
 @pytest.mark.parametrize(
@@ -142,7 +150,7 @@ def test_the_core_adapts_and_trains_in_an_empty_environment(tmp_path: Path) -> N
     (wheel,) = tmp_path.glob("adaafford-*.whl")
     call(sys.executable, "-m", "venv", "new")
     python, adaafford = tmp_path / "new" / "bin" / "python", tmp_path / "new" / "bin" / "adaafford"
-    call(python, "-m", "pip", "install", "--quiet", "--constraint", ROOT / "constraints.txt", wheel)
+    call(python, "-m", "pip", "install", "--quiet", "--no-compile", "--constraint", ROOT / "constraints.txt", wheel)
     for package in ("ray", "sapien", "matplotlib", "plotly"):
         done = subprocess.run([python, "-c", f"import {package}"], capture_output=True, text=True, check=False)
         assert f"No module named '{package}'" in done.stderr

@@ -2,9 +2,6 @@
 
 import os
 import subprocess
-import sys
-import sysconfig
-import venv
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +10,7 @@ import pytest
 from shared.store import export
 from tests.store.test_export_formats import LACKING, SPLITS, expected, make, same
 from tests.support import export_readers
+from tests.support.environments import environment, install
 from tests.support.hub_server import hub_server
 
 ROOT = Path(__file__).parents[2]
@@ -27,24 +25,6 @@ LEROBOT = (
     ),
 )
 """What is installed without its dependencies, which are gigabytes for GPUs, and those that reading needs."""
-
-
-def install(python: Path, *args: str) -> None:
-    """Install packages, or skip the test where there is no index of them."""
-    done = subprocess.run(
-        [python, "-m", "pip", "install", "--quiet", "--no-compile", *args], capture_output=True, text=True
-    )
-    if done.returncode:
-        pytest.skip(f"packages cannot be installed here: {done.stderr.strip().splitlines()[-1]}")
-
-
-def environment(folder: Path) -> Path:
-    """The Python of a new environment that also finds the packages of ours, which need not be installed again."""
-    venv.create(folder, with_pip=True)
-    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    paths = [path for path in sys.path if path.endswith("site-packages")] or [sysconfig.get_path("purelib")]
-    (folder / f"lib/{version}/site-packages/zz_ours.pth").write_text("\n".join(paths) + "\n")
-    return folder / "bin/python"
 
 
 def check(folder: Path, python: Path, readers: dict[str, str]) -> None:
