@@ -52,7 +52,7 @@ def _can_be_file(path: Path) -> Path:
 OutFolder = Annotated[Path, AfterValidator(_can_be_folder)]
 """A folder that a command writes, which is made where missing; what can be none is refused before anything is done."""
 OutFile = Annotated[Path, AfterValidator(_can_be_file)]
-"""A file that a command writes, as `OutFolder`."""
+"""A file that a command writes into a folder that is there; what can be none is refused, too."""
 
 FLAG_STYLE = (tyro.conf.AvoidSubcommands, tyro.conf.EnumChoicesFromValues)
 FLAG_TYPES = ConstructorRegistry()

@@ -170,7 +170,7 @@ def test_a_caption_has_the_stored_outcome_and_says_where_it_was_another(collecte
     ("flags", "line"),
     [
         (["--video", "film.avi"], "film.avi: no video; its name must end in .mp4, .gif, .png"),
-        (["--video", "."], ".: is a folder; name a file"),
+        (["--video", "."], "its name must end in .mp4"),
         (["--rollout", 77, "--video", "a.gif"], "has no interaction of rollout 77; choose another"),
         (["--rollout", 0, "--step", 77, "--video", "a.gif"], "has no interaction of rollout 0, step 77; choose"),
         (["--step", 1, "--video", "a.gif"], "--step 1 needs --rollout"),

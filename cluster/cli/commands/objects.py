@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from pydantic import Field
 
-from cluster.config.flags import Action, OutFile, OutFolder, dispatch
+from cluster.config.flags import Action, OutFolder, dispatch
 from shared.config import PANDA
 from shared.errors import UsageError
 from shared.formatting import counted
@@ -105,7 +105,7 @@ class PreviewCommand:
 
     path: Annotated[Path, tyro.conf.Positional]
     """A folder of objects, or one object's folder."""
-    out: Annotated[OutFile, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional]
     """The picture, a PNG."""
     most: int = 100
     """The most objects to draw."""
@@ -117,7 +117,7 @@ class FilmCommand:
 
     path: Annotated[Path, tyro.conf.Positional]
     """One object's folder, or a folder of objects, whose first usable one is taken."""
-    out: Annotated[OutFile, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional]
     """The picture, a PNG."""
     primitives: tuple[str, ...] = ()
     """Only these primitives; default: all."""

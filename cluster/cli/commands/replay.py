@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cluster.config.flags import OutFile
 from shared.errors import UsageError
 from shared.progress import Progress
 
@@ -35,7 +34,7 @@ class ReplayCommand:
     """The shard that the job makes, such as random-v0-00000000-00000002; with --video, only its rollouts are shown."""
     rollout: int | None = None
     """Number of one rollout."""
-    video: OutFile | None = None
+    video: Path | None = None
     """File of the video: .mp4, .gif, or .png for start, first contact and end in one picture. It needs no GPU."""
     step: int | None = None
     """With --video and --rollout: number of one interaction of the rollout, from 0."""
