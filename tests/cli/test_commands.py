@@ -145,9 +145,6 @@ def test_a_file_in_the_place_of_a_folder_is_refused_before_anything_is_done(
 @pytest.mark.parametrize(
     "command",
     [
-        "objects preview GONE OUT.png",
-        "objects film GONE OUT.png",
-        "store replay GONE --objects GONE --video OUT.gif",
         "adapt --cloud GONE --history GONE --out OUT.ply",
         "view GONE.ply --out OUT.npz",
     ],
