@@ -7,7 +7,7 @@ An answer that comes a second time is not executed again.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -172,7 +172,7 @@ class SimulatedRobot:
         return self.request
 
     def _try(self, step: Step) -> TriedOutcome:
-        """Execute an action that was chosen on a noisy scan, at the nearest point that is seen."""
+        """Execute an action that was chosen on a noisy scan, on the part of the nearest point that is seen."""
         if self._used:
             self._environment = self._again()
             self._restore()
@@ -181,6 +181,8 @@ class SimulatedRobot:
         frame = ScanFrame(camera=(0.0, 0.0, 0.0), origin=self._origin)
         try:
             action = action_at(observed, frame, step.point, step.approach, step.forward)
+            # The nearest kept point says which part it is. It may be a centimetre away; the hand goes where it is told.
+            action = replace(action, point=frame.to_world(step.point))
         except UsageError:
             return TriedOutcome(motion=0.0, success=False, kind=OutcomeKind.NO_CONTACT)  # It points into the air.
         return _told(self._environment.execute(action))

@@ -204,6 +204,22 @@ def test_a_rehearsal_that_is_ended_at_every_write_counts_everything_once(
     assert kills >= 12
 
 
+def test_the_hand_goes_where_it_is_told(
+    make_robot: Callable[..., SimulatedRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    executed = list[Action]()
+
+    def execute(_: object, action: Action) -> Outcome:
+        executed.append(action)
+        return Outcome(OutcomeKind.OK, 0.1, True)
+
+    monkeypatch.setattr(SapienEnvironment, "execute", execute)
+    robot = make_robot()
+    step = a_step(robot, 1)
+    robot.execute(step)
+    assert np.allclose(executed[0].point + rehearsal.BASE, step.point, atol=1e-6)
+
+
 @pytest.mark.parametrize("succeeded", [True, False])
 @pytest.mark.parametrize("error", [PartError, ReachError])
 def test_a_final_action_counts_where_no_other_can_be_proposed_after_it(
