@@ -170,7 +170,7 @@ SMALL = {
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1200)
 def test_a_killed_campaign_ends_as_an_unkilled_one(tmp_path: Path) -> None:
     """SIGKILL in the middle of a collection and of a training stage, other numbers of workers; same digests."""
     whole = tmp_path / "whole"
