@@ -287,43 +287,32 @@ def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: Proposer
         elif method.tries is not None:
             context = make_proposer(method.tries, rng(f"context/{name}"), version)
         tried[name] = _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), start)
+
+    def act_at_start(role: Role, name: MethodName, history: list[Interaction], proposer: Proposer) -> None:
+        """At each budget, execute what the method would do after its first interactions, where they began."""
+        for budget in METHODS.get(name).budgets(config.budgets):
+            if not recorder.sound:
+                return
+            known = history[:budget]
+            recorder.interact(proposer, 1, role, history=known, start=start, method=name, budget=budget)
+
     for name, history in tried.items() if config.exploit_share is not None else ():
         method = METHODS.get(name)
-        version = method.policy_version(plan.policy_version)
-        recorder.policy_version = version
+        version = recorder.policy_version = method.policy_version(plan.policy_version)
         if method.draws_tries and recorder.sound:
             environment.restore(start)
             context = make_proposer(str(method.tries), rng(f"context-by-share/{name}"), version, config.exploit_share)
             most = method.budgets(config.budgets)[-1]
             history = recorder.interact(context, most, Role.CONTEXT_BY_SHARE, method=name)
         exploiter = make_proposer(method.critic, rng(f"exploit-by-share/{name}"), version, config.exploit_share)
-        role = Role.EXPLOIT_BY_SHARE
-        _act_at_start(recorder, role, name, history, exploiter, method.budgets(config.budgets), start)
+        act_at_start(Role.EXPLOIT_BY_SHARE, name, history, exploiter)
     for name, history in tried.items() if config.repeats else ():
         method = METHODS.get(name)
-        if method.tries is None:
-            continue
-        version = method.policy_version(plan.policy_version)
-        recorder.policy_version = version
-        repeater = make_proposer(f"{REPEATING}{method.critic}", rng(f"repeat/{name}"), version, config.exploit_share)
-        role = Role.REPEAT_AT_START
-        _act_at_start(recorder, role, name, history, repeater, method.budgets(config.budgets), start)
-
-
-def _act_at_start(
-    recorder: Recorder,
-    role: Role,
-    method: str,
-    tried: list[Interaction],
-    exploiter: Proposer,
-    budgets: list[int],
-    start: Float,
-) -> None:
-    """At each budget, execute what the method would do after its first interactions, where they began."""
-    for budget in budgets:
-        if not recorder.sound:
-            return
-        recorder.interact(exploiter, 1, role, history=tried[:budget], start=start, method=method, budget=budget)
+        if method.tries is not None:
+            version = recorder.policy_version = method.policy_version(plan.policy_version)
+            critic = f"{REPEATING}{method.critic}"
+            repeater = make_proposer(critic, rng(f"repeat/{name}"), version, config.exploit_share)
+            act_at_start(Role.REPEAT_AT_START, name, history, repeater)
 
 
 def _adapt(

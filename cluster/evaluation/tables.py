@@ -8,7 +8,7 @@ again leaves the same bytes.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -130,7 +130,7 @@ def as_markdown(table: EvaluationTable) -> str:
         f"F-score at threshold 0.5 on random interactions, of which {percent(natural)}% succeed. In brackets: 95% "
         "bootstrap intervals over objects. Sample-success: where the tries left the object, as in the paper; from the "
         "start: where they began. Gap closed: of that in F-score between Where2Act and the oracle, which is told the "
-        f"hidden facts. {like_for_like_note(published, table.exploit_share)} Digest of the interactions: "
+        f"hidden facts. {beside_note(published, table.exploit_share, measured)} Digest of the interactions: "
         f"`{table.store_digest[:16]}`.",
         "",
         *markdown_table(list(shown.values()), ([_cell(row, name) for name in shown] for row in table.rows)),
@@ -138,12 +138,13 @@ def as_markdown(table: EvaluationTable) -> str:
     return "\n".join(lines) + "\n"
 
 
-def like_for_like_note(base_rate: float | None, share: float | None) -> str:
-    """What the like-for-like columns are, in a few sentences.
+def beside_note(base_rate: float | None, share: float | None, measured: Collection[str]) -> str:
+    """What the columns of `BESIDE` are, in a few sentences.
 
     Args:
         base_rate: of success in the published mix.
         share: of a cloud's points, from which actions by share were drawn; None: there were none.
+        measured: those that are shown.
     """
     always_yes = None if base_rate is None else 2 * base_rate / (1 + base_rate)
     note = (
@@ -156,6 +157,8 @@ def like_for_like_note(base_rate: float | None, share: float | None) -> str:
             f" Best share: the points of actions and of AIP's tries are drawn from the best {100 * share:g}% of the "
             "cloud (published: 1%), and the action is executed where the tries began."
         )
+    if "repeat_success" in measured:
+        note += " Repeated: near a try that succeeded, and turned as it was, if one did; the paper does not do this."
     return note
 
 

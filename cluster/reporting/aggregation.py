@@ -26,7 +26,7 @@ from cluster.evaluation.tables import (
     RESULTS_FILE,
     WITHOUT_TRIES,
     ResultRows,
-    like_for_like_note,
+    beside_note,
     share_of_gap,
 )
 from cluster.reporting.style import COLOURS, SOFT
@@ -325,7 +325,7 @@ def _cells(row: PooledRow) -> list[str]:
 
 
 def _like_for_like(comparison: Comparison) -> list[str]:
-    """A table of what was measured as in the paper, and an empty line; none where a run is of an older version."""
+    """A table of what was measured as in the paper, and beside it, and an empty line; none of older versions' runs."""
     rows = comparison.rows
     measured = [name for name in BESIDE if not all(math.isnan(row.shares[name][0]) for row in rows)]
     if not measured:
@@ -337,7 +337,7 @@ def _like_for_like(comparison: Comparison) -> list[str]:
             of_row.append(_with_limits(row.shares[name]))
             if name in STANDS_BESIDE:
                 of_row.append(_of_paper(row.paper[STANDS_BESIDE[name]]))
-    note = like_for_like_note(rows[0].averages["mix_base_rate"], comparison.exploit_share)
+    note = beside_note(rows[0].averages["mix_base_rate"], comparison.exploit_share, measured)
     return [f"Like for like with the paper. {note}", "", *markdown_table(head, cells), ""]
 
 

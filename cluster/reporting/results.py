@@ -15,7 +15,7 @@ from cluster.evaluation.tables import (
     WITHOUT_TRIES,
     Measure,
     ResultRows,
-    like_for_like_note,
+    beside_note,
 )
 from cluster.reporting.page import Cell, Drawing, Row, Section, Table, Tile, plain, shortened
 from cluster.reporting.style import COLOURS, SOFT, laid_out
@@ -133,13 +133,13 @@ def tiles(results: Results) -> tuple[Tile, ...]:
 
 
 def like_for_like(results: Results) -> tuple[Table, ...]:
-    """The table of what was measured as in the paper; none for files that older versions wrote."""
+    """The table of what was measured as in the paper, and beside it; none for files that older versions wrote."""
     found = {name for name in BESIDE for row in results.rows if row.value(name) is not None}
     measured = {name: shown for name, shown in BESIDE.items() if name in found}
     if not measured:
         return ()
     base_rate = next((row.mix_base_rate for row in results.rows), None)
-    note = like_for_like_note(base_rate, results.exploit_share)
+    note = beside_note(base_rate, results.exploit_share, measured)
     return (table_of(results, f"Like for like with the paper. {note}", measured),)
 
 

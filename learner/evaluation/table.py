@@ -347,10 +347,10 @@ class _Judge:
             for role in (Role.EXPLOIT_BY_SHARE, Role.REPEAT_AT_START)
         )
 
-        def of_objects(rows: NDArray[np.int64] | None, chosen: NDArray[np.bool_] | None = None) -> tuple[int, ...]:
+        def of_objects(rows: NDArray[np.int64] | None, those: NDArray[np.bool_] | None = None) -> tuple[int, ...]:
             if rows is None:
                 return ()
-            rows = rows if chosen is None else rows[chosen[rows]]
+            rows = rows if those is None else rows[those[rows]]
             return tuple(np.bincount(self._object_of[rows], minlength=len(self._names)).tolist())
 
         def published_rows(chosen: NDArray[np.bool_]) -> tuple[float, ...]:

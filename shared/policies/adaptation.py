@@ -7,7 +7,7 @@ Shapes: N points of a cloud, A actions, S proposals at a point.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -414,16 +414,22 @@ def reachable_action(
             best = action_from_frame(observation, point, proposals.frames[int(scores.argmax())])
         if observation.reach is None:
             return best
-        for place in scores.argsort(descending=True, stable=True):
-            action = action_from_frame(observation, point, proposals.frames[place])
-            if observation.reach.trajectory(action) is not None:
-                return action
+        best_first = proposals.frames[scores.argsort(descending=True, stable=True)]
+        reached = first_in_reach(observation, (action_from_frame(observation, point, frame) for frame in best_first))
+        if reached is not None:
+            return reached
         likely = reachable_points(observation)[points]
         left &= np.linalg.norm(places - places[chosen], axis=1) > NEAR_M
         if not left.any():
             break
     assert best is not None, "there is a first point"
     return best
+
+
+def first_in_reach(observation: Observation, actions: Iterable[Action]) -> Action | None:
+    """The first action that the arm reaches, or the first of all where no arm is known; None where it reaches none."""
+    reach = observation.reach
+    return next((action for action in actions if reach is None or reach.trajectory(action) is not None), None)
 
 
 def action_from_frame(observation: Observation, point: int, frame: Tensor) -> Action:

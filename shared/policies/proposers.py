@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from shared.errors import UsageError
-from shared.policies.adaptation import Adapter, Proposals, movable_points, reachable_action
+from shared.policies.adaptation import Adapter, Proposals, first_in_reach, movable_points, reachable_action
 from shared.policies.critics import best_action, critic_named, critic_names
 from shared.policies.methods import PROPOSERS, REPEATING, CriticName, ProposerKind
 from shared.types import Action, Float32, Interaction, Observation, Proposer
@@ -138,9 +138,10 @@ class RepeatProposer:
             actions += [Action(int(k), observation.points[k].astype(np.float64), tried.rotation) for k in near]
         if actions:
             scores = self._exploit.critic.predict(observation, actions, history)
-            for action in (actions[int(k)] for k in np.argsort(-scores, kind="stable")[:MOST_REACHED]):
-                if observation.reach is None or observation.reach.trajectory(action) is not None:
-                    return action
+            best_first = np.argsort(-scores, kind="stable")[:MOST_REACHED]
+            reached = first_in_reach(observation, (actions[int(k)] for k in best_first))
+            if reached is not None:
+                return reached
         return self._exploit.propose(observation, history)
 
 
@@ -189,8 +190,10 @@ def proposer_named(
         if share is not None and kind.draw is not None:
             return kind.draw(adapter, rng, budget, share)
         return kind.make(adapter, rng, budget)
+    if adapter is not None and name in critic_names():
+        return ExploitProposer(adapter, rng, name, share)
     critic = name.removeprefix(REPEATING)
-    if critic in critic_names() and adapter is not None:
-        return (ExploitProposer if critic == name else RepeatProposer)(adapter, rng, critic, share)
+    if adapter is not None and critic in critic_names():
+        return RepeatProposer(adapter, rng, critic, share)
     known = ", ".join((*PROPOSERS.names(), *critic_names()))
     raise UsageError(f"no proposer is called '{name}'; allowed: {known}")

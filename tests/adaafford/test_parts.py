@@ -154,7 +154,7 @@ def test_a_part_that_is_not_found_again_and_did_not_move_is_where_it_was(
 
 
 class RememberingSegmenter(GivenSegmenter):
-    """Says how sure it is of the left door from 0 to 1, 0.9 for all that it is asked, and counts the scans."""
+    """Counts the scans that its evidence is of: its confidence in the left door is one over their number."""
 
     def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
         found = super().segment(points, camera, seed)
