@@ -25,3 +25,15 @@ def test_every_step_names_functions_of_its_file() -> None:
         text = "".join((ROOT / path).read_text() for path in MODULE.findall(files))
         missing = [name for name in NAME.findall(names) if not re.search(rf"\b{name}\b *[(:=\[]|class {name}\b", text)]
         assert not missing, f"{files}: {missing}"
+
+
+def test_the_page_counts_the_files_that_it_names() -> None:
+    page = (ROOT / "docs/walkthrough.md").read_text()
+    steps, dispatch = page.partition("## Dispatch")[::2]
+    named = set(MODULE.findall(steps))
+    added = set(MODULE.findall(dispatch.partition("## How a new policy")[0])) - named
+    skipped = set(MODULE.findall(page.partition("## How many files")[2]))
+    assert skipped < named
+    assert f"Steps 1 to 6 name {len(named)} files." in page
+    assert f"takes {len(named - skipped)} of them" in page
+    assert f"Dispatch adds {len(added)}." in page
