@@ -40,7 +40,7 @@ def load_policy(source: str | Path) -> Policy:
             (its last policy).
 
     Raises:
-        UsageError: there is none.
+        UsageError: there is no policy of this name or in this place.
         StoreError: its files are damaged or foreign.
     """
     if str(source) in pretrained_names():

@@ -248,8 +248,8 @@ def checked_scan(
         up: [3], against gravity.
 
     Raises:
-        UsageError: shapes do not agree, or values are none that are allowed, or too few or too many points are left,
-            or they lie too far apart.
+        UsageError: shapes do not agree, a value is not allowed, there are too few or too many measured points, or they
+            are too far apart.
     """
     places = _array(points, "points", source)
     facing = None if normals is None else _array(normals, "normals", source)
@@ -293,9 +293,9 @@ def missing_points(scan: Scan) -> str | None:
 
 
 def doubtful_up(scan: Scan, frame: ScanFrame) -> str | None:
-    """What to tell a user whose frame looks as if up were wrong: 0 0 1 in the frame of a camera, say.
+    """A warning if `frame.up` is probably wrong, for example 0 0 1 in the frame of a camera; otherwise None.
 
-    Ask only where nobody said what is up: a camera may well look straight down.
+    Call it only if the user did not give `up`, because a camera may look straight down.
     """
     place = frame.to_world([frame.camera])[0]
     elevation = float(np.rad2deg(np.arctan2(place[2], np.hypot(place[0], place[1]))))

@@ -74,7 +74,7 @@ class OutcomeKind(StrEnum):
 
 
 class Direction(StrEnum):
-    """Which ways a joint turns from where it starts; hidden from view ("pushing faucet" in the paper)."""
+    """In which directions a joint can turn from its start position; hidden (the task "pushing faucet" of the paper)."""
 
     AS_BUILT = "as-built"
     """The joint's own limits."""
@@ -146,7 +146,7 @@ class HiddenDynamics:
 
 
 class DenseGeometry(Protocol):
-    """What is known of an object's surface beyond the points of its cloud."""
+    """The surface of an object at a finer resolution than the points of its cloud."""
 
     def points(self) -> Float32:
         """The surface at the full resolution of its sensor, [M, 3], world frame."""
@@ -232,7 +232,10 @@ class Action:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The outcome of an action. A robot only needs to fill the first three fields."""
+    """The outcome of an action: m, r, and how it ended. A robot only needs to fill the first three fields.
+
+    NaN stands for what was not measured.
+    """
 
     kind: OutcomeKind
     motion: float
@@ -267,12 +270,15 @@ class Environment(Protocol):
         ...
 
     def execute(self, action: Action) -> Outcome:
-        """Execute the action; a physical failure is an outcome, not an exception."""
+        """Execute the action at one of the points of the last observation, and change the state of the object.
+
+        A physical failure is an outcome, not an exception.
+        """
         ...
 
 
 class Proposer(Protocol):
-    """Chooses the next action."""
+    """Chooses the next action u = (p, R), such as AIP (AdaAfford, Next-step Interaction Action Proposal)."""
 
     @property
     def name(self) -> str:
@@ -280,5 +286,13 @@ class Proposer(Protocol):
         ...
 
     def propose(self, observation: Observation, history: Sequence[Interaction]) -> Action | None:
-        """The next action, or None to stop."""
+        """The next action, or None to stop.
+
+        Args:
+            observation: of the present state.
+            history: the interactions with this object so far, in their order.
+
+        Raises:
+            UsageError: the observation has no movable point, or lacks what the proposer needs.
+        """
         ...

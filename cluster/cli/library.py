@@ -156,7 +156,7 @@ def ray_source(
             read.
 
     Raises:
-        UsageError: Ray Data is not installed, or there is no such column or field, or a condition is none.
+        UsageError: Ray Data is not installed, there is no such column or field, or a condition is not valid.
         StoreError: the store cannot be read.
     """
     require_packages("adaafford.ray_source", "ray", "pandas")

@@ -128,10 +128,10 @@ def as_markdown(table: EvaluationTable) -> str:
         "",
         f"{table.rollouts} trials on {table.objects} test objects, seed {table.seed}, policy {table.policy_version}. "
         f"F-score at threshold 0.5 on random interactions, of which {percent(natural)}% succeed. In brackets: 95% "
-        "bootstrap intervals over objects. Sample-success: where the tries left the object, as in the paper; from the "
-        "start: where they began. Gap closed: of that in F-score between Where2Act and the oracle, which is told the "
-        f"hidden facts. {beside_note(published, table.exploit_share, measured)} Digest of the interactions: "
-        f"`{table.store_digest[:16]}`.",
+        "bootstrap intervals over objects. Sample-success: in the state that the interactions left, as in the paper; "
+        "from the start: in the start state. Gap closed: share of the gap in F-score between Where2Act and the oracle, "
+        f"which is given the hidden facts. {beside_note(published, table.exploit_share, measured)} Digest of the "
+        f"interactions: `{table.store_digest[:16]}`.",
         "",
         *markdown_table(list(shown.values()), ([_cell(row, name) for name in shown] for row in table.rows)),
     ]
@@ -148,17 +148,17 @@ def beside_note(base_rate: float | None, share: float | None, measured: Collecti
     """
     always_yes = None if base_rate is None else 2 * base_rate / (1 + base_rate)
     note = (
-        "Published mix: the same questions, weighted as the paper's test rollouts were topped up by label, of which "
+        "Published mix: the same interactions, weighted as the paper's test rollouts were topped up by label, of which "
         f"{percent(base_rate)}% succeed (a critic that always says yes has an F-score of {percent(always_yes)}); "
         "shifted: with logits moved by the change of the base rate."
     )
     if share is not None:
         note += (
-            f" Best share: the points of actions and of AIP's tries are drawn from the best {100 * share:g}% of the "
-            "cloud (published: 1%), and the action is executed where the tries began."
+            " Best share: the points of actions and of AIP's interactions are drawn from the best "
+            f"{100 * share:g}% of the cloud (published: 1%), and the action is executed in the start state."
         )
     if "repeat_success" in measured:
-        note += " Repeated: near a try that succeeded, and turned as it was, if one did; the paper does not do this."
+        note += " Repeated: near an interaction that succeeded, with its rotation, if one did; not in the paper."
     return note
 
 

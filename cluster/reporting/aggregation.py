@@ -330,7 +330,7 @@ def _like_for_like(comparison: Comparison) -> list[str]:
     measured = [name for name in BESIDE if not all(math.isnan(row.shares[name][0]) for row in rows)]
     if not measured:
         return []
-    head, cells = ["method", "tries"], [[markdown(row.method), str(row.budget)] for row in rows]
+    head, cells = ["method", "interactions"], [[markdown(row.method), str(row.budget)] for row in rows]
     for name in measured:
         head += [BESIDE[name], *(["paper"] if name in STANDS_BESIDE else [])]
         for row, of_row in zip(rows, cells, strict=True):

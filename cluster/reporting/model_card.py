@@ -204,5 +204,5 @@ def _use(policy: Policy) -> str:
     return f"""## Use
 
 `adaafford adapt --policy FOLDER --cloud scan.ply --history history.json`, or in Python
-`Adapter(load_policy("FOLDER"))`; FOLDER is where this file lies, or `{policy.task}` if the package brings it.
+`Adapter(load_policy("FOLDER"))`; FOLDER is the folder of this file.
 Exported with {versions}."""

@@ -75,7 +75,7 @@ class Proposals:
 
     Attributes:
         point: index of p.
-        frames: approach and forward, view frame, and the pinch profile where networks are told it, [S, 6 or more].
+        frames: approach and forward, view frame, and the pinch profile if the policy uses it, [S, 6 or more].
     """
 
     point: int
@@ -83,10 +83,15 @@ class Proposals:
 
 
 class Adapter:
-    """A policy at test time.
+    """A policy at test time: z of a history, and the scores and actionabilities given z.
 
-    Clouds are encoded when first needed and cached by the identity of their observation, and so is what does not depend
-    on the history: an interaction is encoded once, and a new history costs the last layers of D.
+    Each cloud is encoded when it is first needed, and each interaction once. Both are cached by the identity of the
+    observation, so after a new interaction only the layers that read z are computed again.
+
+    It does not check that the networks are trained; critics and proposers do.
+
+    Args:
+        policy: its networks are switched to evaluation mode.
 
     Example:
         >>> adapter = Adapter(Policy.from_files(files))
@@ -110,7 +115,15 @@ class Adapter:
 
     @torch.inference_mode()
     def z(self, history: Sequence[Interaction], module: ModuleName = "aap") -> Tensor:
-        """The hidden information z of a history in any order, [latent_width]; the history may be empty."""
+        """z_I, the hidden information in a history (AdaAfford, Adaptive Affordance Prediction), [latent_width].
+
+        Args:
+            history: interactions in any order; may be empty.
+            module: "aap", or a baseline that encodes a history.
+
+        Raises:
+            UsageError: the baseline is not trained, or a motion is negative or not finite.
+        """
         return self._adaptive(module).latent(*self._history_codes(history, module))
 
     @torch.inference_mode()
@@ -158,13 +171,23 @@ class Adapter:
         module: ModuleName = "aap",
         points: NDArray[np.int64] | None = None,
     ) -> Float32:
-        """A_I: the AAP actionability after a history, in [0, 1], of every point, [N], or of `points` only."""
+        """A_I, the affordance posterior: the AAP actionability after a history, [N] or [len(points)], in [0, 1].
+
+        Args:
+            observation: with N points.
+            history: interactions; may be empty.
+            module: "aap", or a baseline that encodes a history.
+            points: indices of the points to score; None: all.
+
+        Raises:
+            UsageError: as `z`; or the policy needs pinch profiles, and the observation has no dense geometry.
+        """
         told = self._told_of_points(observation, module, points)
         return self._adaptive(module).affordance(told, self.z(history, module)).numpy()
 
     @torch.inference_mode()
     def prior_affordance(self, observation: Observation, points: NDArray[np.int64] | None = None) -> Float32:
-        """A: Where2Act's actionability, in [0, 1], of every point, [N], or of `points` only."""
+        """A, the affordance prior: Where2Act's actionability of all points, [N], or of `points` only, in [0, 1]."""
         return self.policy.prior.affordance(self._told_of_points(observation, "prior", points)).numpy()
 
     @torch.inference_mode()
@@ -175,7 +198,7 @@ class Adapter:
         history: Sequence[Interaction],
         module: ModuleName = "aap",
     ) -> Float32:
-        """The AAP scores s_u|z of actions after a history, [A], in [0, 1]."""
+        """The AAP scores s_u|z, success probabilities of actions after a history, [A]; raises as `affordance`."""
         points, frames = point_indices(actions), self.frames(observation, actions)
         return self._scores(observation, module, points, frames, self.z(history, module)).numpy()
 
@@ -212,14 +235,20 @@ class Adapter:
 
     @torch.inference_mode()
     def proposals(self, observation: Observation, point: int, rng: np.random.Generator) -> Proposals:
-        """Rotations at a point, from the prior's Action Proposal Network."""
+        """100 rotations at a point, from the Action Proposal Network of Where2Act's prior.
+
+        Args:
+            observation: with N points.
+            point: index of the point.
+            rng: of the noise that the network turns into rotations.
+        """
         noise = rng.standard_normal((PROPOSALS, self.policy.config.noise_width)).astype(np.float32)
         features = self.features(observation, "prior", np.array([point]))
         frames = self.policy.prior.propose(features, torch.from_numpy(noise))
         return Proposals(point, self._told(observation, np.full(len(frames), point), frames))
 
     def frames(self, observation: Observation, actions: Sequence[Action]) -> Tensor:
-        """Actions as networks are told them: approach and forward, and the pinch profile where they are told it.
+        """Actions as inputs of the networks: approach and forward, and the pinch profile if the policy uses it.
 
         Returns:
             [A, 6 or more], view frame.
@@ -260,7 +289,10 @@ class Adapter:
 
     @torch.inference_mode()
     def information(self, observation: Observation, points: NDArray[np.int64], latent: Tensor) -> Float32:
-        """The AIP actionability a^AIP_p|z of the points at the indices `points`, [len(points)]."""
+        """The AIP actionability a^AIP_p|z of the points at the indices `points`, [len(points)].
+
+        By default of the training it is an expected drop of AAP's loss, so it has no fixed range.
+        """
         expected = self.policy.aap.affordance(self._told_of_points(observation, "aap", points), latent)
         told = self._told_of_points(observation, "aip", points)
         return self.policy.aip.affordance(told, latent, expected).numpy()

@@ -39,7 +39,7 @@ class Critic(Protocol):
 
 
 def critic_names() -> list[CriticName]:
-    """Of Where2Act, AAP and all baselines."""
+    """The names of all critics: Where2Act, AAP and the baselines."""
     return ["where2act", "aap", *BASELINES.names()]
 
 
@@ -78,7 +78,11 @@ def best_action(
 
 
 class Where2ActCritic:
-    """The prior, which ignores the history."""
+    """The prior (Where2Act), which ignores the history.
+
+    Raises:
+        UsageError: the prior of the policy is not trained.
+    """
 
     name: CriticName = "where2act"
 
@@ -104,7 +108,15 @@ class Where2ActCritic:
 
 
 class AdaptiveCritic:
-    """AAP, or a baseline whose network has its form and reads a history through z."""
+    """AAP, or a baseline whose network has the same interface and reads a history through z.
+
+    Args:
+        adapter: the policy at test time.
+        name: "aap", or the name of the baseline.
+
+    Raises:
+        UsageError: the prior or this network is not trained.
+    """
 
     def __init__(self, adapter: Adapter, name: ModuleName) -> None:
         adapter.policy.require("prior", name)

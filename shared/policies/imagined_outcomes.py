@@ -24,7 +24,7 @@ from shared.policies.proposers import TOP_POINTS, best_points
 from shared.types import Action, Interaction, Observation
 
 CANDIDATES = 32
-"""Half of them among the points that AAP thinks most of, the others anywhere."""
+"""Half of them among the points of highest AAP actionability, the others anywhere."""
 BEST = 6
 """The value of information is the mean belief in so many candidates."""
 ASKED = 4
@@ -111,7 +111,7 @@ class _ImaginingProposer:
 
 
 class InformationGainProposer(_ImaginingProposer):
-    """Proposes the action after which the beliefs in random actions are expected to move furthest from those of now.
+    """Proposes the action after which the beliefs in random actions are expected to change most.
 
     The distance is the Kullback-Leibler divergence. For beliefs that agree with each other, its expectation is the
     mutual information of the outcome and the success of a random action.

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 MethodName = Name
 BaselineName = Name
 CriticName = Name
-"""Of whose beliefs count: where2act, aap, or a baseline."""
+"""The name of a critic: where2act, aap, or a baseline."""
 REPEATING = "repeat-"
-"""Before the name of a critic: of the proposer that repeats what succeeded, by its beliefs."""
+"""Prefix of a critic's name; names the proposer that repeats what succeeded, by the scores of this critic."""
 ModuleName = Name
-"""Of a network that a policy may hold: prior, aap, aip, or a baseline."""
+"""The name of a network of a policy: prior, aap, aip, or a baseline."""
 
 RANDOM = "random"
 """The proposer that needs no policy, and that everything is compared with."""
@@ -170,7 +170,7 @@ def needs_policy(proposer: Name) -> bool:
 
 
 def baselines_of(methods: Sequence[MethodName]) -> list[BaselineName]:
-    """The networks of their own that methods need, each once."""
+    """The baselines whose networks the methods need, each once."""
     wanted = {METHODS.get(name).critic for name in methods}
     return [name for name in BASELINES.names() if name in wanted]
 

@@ -63,7 +63,7 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class Policy:
-    """The prior, AAP and AIP of one task, and the learnt baselines where somebody wanted them.
+    """The prior, AAP and AIP of one task, and the baselines that were trained with them.
 
     Attributes:
         task: name of the task that they were trained for.
@@ -116,7 +116,7 @@ class Policy:
         self.baselines[name] = begun
 
     def baseline(self, name: BaselineName, kind: type[Module]) -> Module:
-        """The network of a baseline that was begun."""
+        """The network of a baseline that was begun, which is a `kind`."""
         network = self.baselines[name]
         assert isinstance(network, kind), f"{name} is no {kind.__name__}"
         return network
@@ -184,10 +184,10 @@ class Policy:
             )
 
     def check_camera(self, camera: CameraConfig) -> None:
-        """Check that a camera keeps what the networks are told.
+        """Check that the camera keeps what the networks need as input.
 
         Raises:
-            UsageError: they are told pinch profiles, and it keeps no depth images.
+            UsageError: the networks need pinch profiles, and the camera keeps no depth images.
         """
         if self.config.pinch_profile and not camera.keep_depth:
             raise UsageError(

@@ -19,9 +19,9 @@ from shared.types import Action, Float32, Interaction, Observation, Proposer
 TOP_POINTS = 100
 """Points that an exploit is drawn from (AdaAfford, Evaluation Metrics)."""
 REPEAT_M = 0.12
-"""How far from a try that succeeded its repetition may be; the part has moved since, and the hand with it."""
+"""Metres from an interaction that succeeded to its repetition; the part has moved since, and the hand with it."""
 MOST_REACHED = 50
-"""Repetitions of which an arm is asked whether it reaches them."""
+"""The most repetitions that are checked for whether the arm reaches them."""
 STOP_THRESHOLD = 0.0
 """The paper says "e.g., 0.05", but the AIP score is a drop of a loss whose mean here is about 0.003, so that 0.05 would
 stop at once; 0 stops where no point promises any gain."""
@@ -39,6 +39,17 @@ class AipProposer:
     the published code draws from the best 100 of 10,000 (AdaAffordCode, code/sample_succ.py, `while len(xs) < 100`).
 
     Deviation: `at_least` interactions are proposed in spite of the threshold, because an empty history reveals nothing.
+
+    Attributes:
+        adapter: the policy at test time.
+        rng: of the proposed rotations, and of the drawn points.
+        budget: the most interactions.
+        threshold: of the highest AIP actionability.
+        at_least: interactions that are proposed without regard to the threshold.
+        share: of the cloud's points, above 0 and at most 1; None: the best point is taken.
+
+    Raises:
+        UsageError: prior, AAP or AIP is not trained.
     """
 
     name = "aip"
@@ -90,6 +101,15 @@ class ExploitProposer:
 
     Published clouds have 10,000 points and ours fewer, so that 100 are a larger part of them: with a `share`, the point
     is one of that share of the cloud's points, 0.01 as published (AdaAffordCode, code/sample_succ.py).
+
+    Args:
+        adapter: the policy at test time.
+        rng: of the drawn point and the proposed rotations.
+        critic: the name of the critic.
+        share: of the cloud's points, above 0 and at most 1; None: 100 points.
+
+    Raises:
+        UsageError: there is no such critic, or its networks are not trained.
     """
 
     def __init__(
@@ -114,13 +134,15 @@ class ExploitProposer:
 
 
 class RepeatProposer:
-    """Repeats what succeeded, where a critic believes in it most: the final action on a robot.
+    """Repeats an interaction that succeeded, near its point: the final action on a robot.
 
-    Of all actions that are turned as a try that succeeded was, at the movable points within `REPEAT_M` of it, it takes
-    the one with the highest score. It cannot be the same point, since the part has moved. Where no try succeeded, or
-    the arm reaches none of these actions, it does as `ExploitProposer`, with the same arguments.
+    Candidates have the rotation of an interaction that succeeded, at the movable points within `REPEAT_M` of it. The
+    one with the highest score of the critic is taken. It need not be at the same point, since the part has moved. If no
+    interaction succeeded, or the arm reaches none of the candidates, it acts as `ExploitProposer`.
 
-    Addition: the paper draws the point of the final action from the best ones, whatever was tried.
+    Addition: the paper draws the point of the final action from the best ones, whatever the interactions showed.
+
+    Args and errors are those of `ExploitProposer`.
     """
 
     def __init__(

@@ -40,7 +40,7 @@ class InteractionDataset(IterableDataset[dict[str, Any]]):
 
     A sample is a dict: a cell for each column (a number, a text, or an array), an array for each field of the cloud
     ([N, 3], see `shared.types.Observation`), and `position`, which `consumed` takes. Shards come in random order, and
-    the rows of `together` shards that follow each other are mixed; so many are in memory. Each process of
+    the rows of `together` consecutive shards are mixed, and these shards are in memory at once. Each process of
     `torch.distributed` and each worker of a `DataLoader` reads every n-th of these groups, so that together they read
     every row once an epoch; their numbers of rows may differ. What comes to the store later is not read.
 
@@ -53,7 +53,7 @@ class InteractionDataset(IterableDataset[dict[str, Any]]):
         together: shards whose rows are mixed.
 
     Raises:
-        UsageError: there is no such column or field, or a condition is none.
+        UsageError: there is no such column or field, or a condition is not valid.
         StoreError: a file is damaged or foreign; reading raises it, too.
     """
 

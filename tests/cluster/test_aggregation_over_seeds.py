@@ -123,7 +123,7 @@ def test_the_files_hold_it(runs: tuple[list[Path], object], tmp_path: Path) -> N
     write_comparison(tmp_path / "out", found)
     text = (tmp_path / "out" / MARKDOWN_FILE).read_text()
     assert text.count("*77.4*") == 3  # The paper's F-score of ours-final after one try, also beside the mix.
-    assert "| method | tries | F, published mix | paper | F, published mix, shifted | paper |" in text
+    assert "| method | interactions | F, published mix | paper | F, published mix, shifted | paper |" in text
     assert "seed 0 | seed 1" in text
     read = list(csv.DictReader((tmp_path / "out" / CSV_FILE).read_text().splitlines()))
     assert [row["method"] for row in read] == ["where2act", "ours-final", "oracle"]
