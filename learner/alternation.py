@@ -246,6 +246,11 @@ class AlternationRecord(BaseModel):
     best: int = Field(ge=1, le=1000)
 
 
+def is_training(out: Path) -> bool:
+    """Whether a folder is the --out of an alternation, or of a single stage that is finished."""
+    return (out / ALTERNATION_FILE).is_file() or (out / DONE_FILE).is_file()
+
+
 def trained_in(out: Path) -> Path:
     """The folder of the best policy in the --out of an alternation, or of a single stage.
 

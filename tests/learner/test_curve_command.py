@@ -134,3 +134,4 @@ def test_a_trainings_policy_is_exported_with_a_table(
         assert run([*exporting, *wrong]) == 2
         assert why in capsys.readouterr().err
     assert run(["export-policy", str(folder / "seed-1"), "--out", str(tmp_path / "p")]) == 2
+    assert "add --store" in capsys.readouterr().err

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from cluster.config.flags import OutFolder, parse_flags
+from shared.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +35,14 @@ def main(args: list[str]) -> int:
     command = parse_flags(ExportPolicyCommand, args, "export-policy")
     from cluster.reporting.model_card import export, source_of_run, source_of_training, write_export
     from cluster.runs.run_folder import find
+    from learner.alternation import is_training
     from shared.store import Store
 
     if command.store is None:
+        if is_training(command.run):
+            raise UsageError(
+                f"{command.run}: the folder of a training and not of a run; add --store, the store of its interactions"
+            )
         source = source_of_run(find(command.run)[0], command.policy)
     else:
         source = source_of_training(command.run, Store.open(command.store), command.results, command.origin)
