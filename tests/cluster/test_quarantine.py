@@ -17,6 +17,7 @@ from cluster.collection.driver import Collected, collect
 from cluster.workers.retries import MAX_FAULTS, MAX_LOSSES, Failure, JobError, RetryPolicy
 from cluster.workers.session import worker_groups
 from cluster.workers.worker_group import SerialWorkerGroup
+from collector.job_result import JobResult
 from collector.watchdog import Limits
 from learner.data.dataset import load_dataset
 from shared.errors import StoreError, WorkerError
@@ -185,6 +186,19 @@ def test_a_replayed_rollout_must_be_of_its_shard(tmp_path: Path, capsys: pytest.
     fill(store, {})
     assert adaafford(["store", "replay", str(tmp_path), JOB.shard_id, "--objects", "objects", "--rollout", "8"]) == 2
     assert "rollout 8 is not of this shard; allowed: 4 to 7" in capsys.readouterr().err
+
+
+def test_a_replayed_job_is_summarised_in_a_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = new_store(tmp_path)
+    fill(store, {})
+    capfd.readouterr()
+    made = JobResult(JOB.shard_id, 4, 12, 1, {"ok": 11, "no-contact": 1}, {"total": 0.5})
+    monkeypatch.setattr("collector.worker.Worker.run", lambda self, plan, job, under_way: made)
+    assert adaafford(["store", "replay", str(tmp_path), JOB.shard_id, "--objects", "objects"]) == 0
+    summary = f"{JOB.shard_id}: 4 rollouts, 12 interactions, 1 successful; no-contact 1, ok 11"
+    assert capfd.readouterr().out == f"{summary}\n"
 
 
 def test_a_committed_job_is_not_done_again(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import faulthandler
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,9 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from shared.errors import UsageError
+from shared.formatting import counted
 from shared.progress import Progress
 
 if TYPE_CHECKING:
+    from collector.job_result import JobResult
     from shared.plan import Job, RolloutRecord
 
 
@@ -101,7 +104,7 @@ def _replay_job(command: ReplayCommand) -> int:
         print(_described(worker.execute(plan, command.rollout, StageClock())))
         return 0
     print(f"executing {job.shard_id}", file=sys.stderr)
-    print(worker.run(plan, job, under_way=_announce))
+    print(_summary(worker.run(plan, job, under_way=_announce)))
     return 0
 
 
@@ -130,5 +133,15 @@ def _announce(rollout: int | None) -> None:
 def _described(record: "RolloutRecord") -> str:
     """A rollout in one line."""
     outcomes = Counter(row.outcome.kind.value for row in record.interactions)
-    counts = ", ".join(f"{name} {count}" for name, count in sorted(outcomes.items())) or "no interactions"
-    return f"rollout {record.index} (object {record.object.id}): {record.status}; {counts}"
+    return f"rollout {record.index} (object {record.object.id}): {record.status}; {_counts(outcomes)}"
+
+
+def _summary(result: "JobResult") -> str:
+    """The result of a job in one line."""
+    made = f"{counted(result.rollouts, 'rollout')}, {counted(result.interactions, 'interaction')}"
+    return f"{result.shard_id}: {made}, {result.successes} successful; {_counts(result.outcomes)}"
+
+
+def _counts(outcomes: Mapping[str, int]) -> str:
+    """Numbers of interactions by outcome kind."""
+    return ", ".join(f"{name} {count}" for name, count in sorted(outcomes.items())) or "no interactions"
