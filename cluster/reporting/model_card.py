@@ -194,7 +194,7 @@ def _limits(collection: CollectionConfig) -> str:
 - Trained in simulation alone: rigid parts, one hinge or slide at a time, a flying {hand}, {depth}.
 - The object stands upright and alone in the cloud, in metres, of about the size that the training objects have (they
   fit into a ball of radius 1), seen from {camera.elevation_deg.low:g} to {camera.elevation_deg.high:g} deg above.
-- What is called a probability is one on objects like those of training, and on no others.
+- Predicted probabilities are valid only for objects like those of training.
 - It knows neither reach nor safety: check poses, speeds and forces before an arm moves.
 - Half precision: scores differ from those of the trained weights by less than 0.001."""
 
