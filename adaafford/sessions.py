@@ -35,7 +35,7 @@ from adaafford.scans import (
 )
 from shared import seeds
 from shared.arms.arm import Arm
-from shared.arms.reach import ArmReach, reachable_points
+from shared.arms.kinematics import ArmReach, reachable_points
 from shared.config import Name, StrictModel
 from shared.errors import UsageError
 from shared.io.files import create_exclusively

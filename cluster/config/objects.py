@@ -4,8 +4,7 @@ import logging
 from collections.abc import Iterable
 from pathlib import Path
 
-from cluster.config.campaign_config import SplitConfig
-from cluster.config.command_settings import ObjectSelection
+from cluster.config.campaign_config import ObjectSelection, SplitConfig
 from collector.objects.catalogue import Catalogue, ObjectSplit, for_task, of_categories, read_list, scan, split
 from collector.objects.procedural.catalogue import EVERY_CATEGORY, categories_of, generate
 from shared.errors import UsageError

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import FrozenFeatures
-from learner.evaluation.published_mix import mix_for, shifted_threshold
-from learner.metrics import THRESHOLD, discrimination, ratio_interval
+from learner.metrics import THRESHOLD, discrimination, mix_for, ratio_interval, shifted_threshold
 from learner.stages.oracle import OracleCritic, Teacher
 from learner.stages.trainers import RowCritic, row_critic
 from shared.errors import StoreError
@@ -60,7 +59,7 @@ class ObjectCounts:
         successes: those that succeeded.
         start_trials: EXPLOIT_AT_START rows; where a method tries nothing, these are the EXPLOIT rows.
         start_successes: those that succeeded.
-        mix_true: published rows that successful QUERY rows stand for (see `learner.evaluation.published_mix`). This and
+        mix_true: published rows that successful QUERY rows stand for (see `learner.metrics`). This and
             what follows is empty where it was not counted, as in results of older versions.
         mix_claimed: those that rows stand for which the critic called successes.
         mix_hits: those that both hold of.
@@ -148,7 +147,7 @@ class EvaluationRow(BaseModel):
         start_success: share of the EXPLOIT_AT_START rows that succeeded.
         trials: how many EXPLOIT rows.
         mean_tries: interactions made a rollout, which stopping may leave below the budget.
-        mix_f_score: as `f_score`, on the published mix of rows (see `learner.evaluation.published_mix`).
+        mix_f_score: as `f_score`, on the published mix of rows (see `learner.metrics`).
         shifted_f_score: the same after logits are shifted by logit(`mix_base_rate`) - logit(`base_rate`).
         share_success: share of the EXPLOIT_BY_SHARE rows that succeeded.
         repeat_success: share of the REPEAT_AT_START rows that succeeded.

@@ -14,7 +14,7 @@ import numpy as np
 
 from shared.errors import StoreError
 from shared.io.documents import with_checksum
-from shared.io.redaction import without_places
+from shared.io.text import without_places
 from shared.plan import Job, RolloutRecord, RolloutStatus
 from shared.store.backends.base import Folder, StorageBackend, Transaction
 from shared.store.codecs import observations

@@ -12,8 +12,19 @@ from typing import Literal
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
-from collector.objects.procedural.assembly import hinged, sliding
-from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, rod
+from collector.objects.procedural.shapes import (
+    BACK,
+    FRONT,
+    LEFT,
+    RIGHT,
+    TOP,
+    block,
+    grip,
+    hinged,
+    hollow_box,
+    rod,
+    sliding,
+)
 
 GAP = 0.006
 """Between a panel and what it lies on, and between neighbours."""

@@ -9,9 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces
-from collector.objects.procedural.assembly import either, shifted
 from collector.objects.procedural.cabinets import Carcass, FrontPanel, random_table
-from collector.objects.procedural.shapes import block, moved
+from collector.objects.procedural.shapes import block, either, moved, shifted
 
 WALL = 0.018
 
