@@ -223,7 +223,11 @@ def _pooled(method: str, budget: int, results: Sequence[_Results], novel_categor
     task = results[0].task
     rows = [next(row for row in each.rows if (row.method, row.budget) == (method, budget)) for each in results]
     counts = [row.counts for row in rows]
-    together = _together([_by_content(each, contents.contents) for each, contents in zip(counts, results, strict=True)])
+    # Objects are called by what they are, because runs call other objects the same.
+    called = [
+        tuple(of.contents.get(name, name) for name in each.object) for each, of in zip(counts, results, strict=True)
+    ]
+    together = _together([replace(each, object=names) for each, names in zip(counts, called, strict=True)])
     averages = {}
     for name in AVERAGED:
         known = [value for row in rows if (value := getattr(row, name)) is not None]
@@ -231,8 +235,8 @@ def _pooled(method: str, budget: int, results: Sequence[_Results], novel_categor
     return PooledRow(
         method=method,
         budget=budget,
-        shares={name: getattr(together, name)() for name in _ALL_MEASURES},
-        by_run={name: tuple(getattr(each, name)()[0] for each in counts) for name in _ALL_MEASURES},
+        shares={name: together.share(name) for name in _ALL_MEASURES},
+        by_run={name: tuple(each.share(name)[0] for each in counts) for name in _ALL_MEASURES},
         paper={
             measure: published_figure(task, method, budget, measure, novel_categories=novel_categories)
             for measure in PUBLISHED_MEASURES
@@ -241,11 +245,6 @@ def _pooled(method: str, budget: int, results: Sequence[_Results], novel_categor
         trials=sum(together.trials),
         averages=averages,
     )
-
-
-def _by_content(counts: ObjectCounts, contents: Mapping[str, str]) -> ObjectCounts:
-    """With objects called by what they are."""
-    return replace(counts, object=tuple(contents.get(name, name) for name in counts.object))
 
 
 def _together(counts: Sequence[ObjectCounts]) -> ObjectCounts:

@@ -23,7 +23,7 @@ from cluster.runs.run_folder import RunFolder, read_json
 from cluster.runs.run_log import RunLog
 from shared.errors import UsageError
 from shared.formatting import terminal_table
-from shared.io.files import make_folder, read_bounded, scratch_folder, write_atomically
+from shared.io.files import read_bounded, scratch_folder, write_atomically
 from shared.io.text import plain
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
@@ -38,8 +38,11 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
     Args:
         run: a run that was evaluated.
         config: its configuration.
-        experiments: whether to simulate other hidden facts for the page.
+        experiments: whether to simulate other hidden facts for the page, which takes some more seconds.
         say: receives a line for each step.
+
+    Raises:
+        StoreError: a file of the run is damaged or foreign.
     """
     run_log, store = RunLog(run.log), Store.open(run.store)
     used = run.objects_used()
@@ -65,8 +68,31 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
         "earlier_software": _earlier_software(run, run_log),
     }
     write_atomically(run.summary, json.dumps(summary, indent=1, allow_nan=False).encode())
-    draw_adaptation(Store.open(run.evaluation), Policy.from_files(store.read_policy(versions[-1])), run.picture)
-    write_page(run, config, experiments=experiments, say=say)
+    evaluation, policy = Store.open(run.evaluation), Policy.from_files(store.read_policy(versions[-1]))
+    draw_adaptation(evaluation, policy, run.picture)
+    adapter, found = Adapter(policy), first_trials(evaluation)
+    say("drawing tables, curves and clouds")
+    novel = run.are_novel(used.test)
+    results = read_results(run.training("evaluate") / RESULTS_FILE, config.task, novel_categories=novel)
+    further = _further(run)
+    sections = [
+        *([_picture(run.picture)] if run.picture.is_file() else []),
+        results_section(results),
+        *([further_section(further)] if further else []),
+        proposals_section(most_telling(found, adapter), adapter),
+        _hidden_facts(run, evaluation, adapter, say) if experiments else _not_tried(run),
+        failures_section(found, adapter),
+        training_section(run.trainings, list(run_log.seconds)),
+        collection_section(summary, store, run_log),
+    ]
+    page = Page(
+        title=f"AdaAfford: {config.task}",
+        subtitle=_subtitle(summary, config, results),
+        tiles=tiles(results),
+        sections=tuple(sections),
+        facts=_facts(summary, run),
+    )
+    write_atomically(run.page, render(page).encode())
 
 
 def print_report(run: RunFolder) -> None:
@@ -193,47 +219,6 @@ def _histogram(motions: list[float]) -> list[dict[str, Any]]:
 MAX_PICTURE_BYTES = 4 << 20
 MAX_FURTHER = 20
 """Evaluations beside the run's own that are shown."""
-
-
-def write_page(run: RunFolder, config: CampaignConfig, *, experiments: bool, say: Callable[[str], None]) -> None:
-    """Write RUN/report.html.
-
-    Args:
-        run: a run with summary.json.
-        config: its configuration.
-        experiments: whether to simulate other hidden facts, which takes some more seconds.
-        say: receives a line for each step.
-
-    Raises:
-        StoreError: a file of the run is damaged or foreign.
-    """
-    summary = read_json(run.summary)
-    store, evaluation = Store.open(run.store), Store.open(run.evaluation)
-    policy = Policy.from_files(store.read_policy(store.policy_versions()[-1]))
-    adapter, found = Adapter(policy), first_trials(evaluation)
-    say("drawing tables, curves and clouds")
-    novel = run.are_novel(run.objects_used().test)
-    results = read_results(run.training("evaluate") / RESULTS_FILE, config.task, novel_categories=novel)
-    further = _further(run)
-    sections = [
-        *([_picture(run.picture)] if run.picture.is_file() else []),
-        results_section(results),
-        *([further_section(further)] if further else []),
-        proposals_section(most_telling(found, adapter), adapter),
-        _hidden_facts(run, evaluation, adapter, say) if experiments else _not_tried(run),
-        failures_section(found, adapter),
-        training_section(run.trainings, list(summary["stage_seconds"])),
-        collection_section(summary, store, RunLog(run.log)),
-    ]
-    page = Page(
-        title=f"AdaAfford: {config.task}",
-        subtitle=_subtitle(summary, config, results),
-        tiles=tiles(results),
-        sections=tuple(sections),
-        facts=_facts(summary, run),
-    )
-    make_folder(run.path)
-    write_atomically(run.page, render(page).encode())
 
 
 def _further(run: RunFolder) -> list[tuple[str, Results]]:

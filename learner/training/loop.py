@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ParamSpec, Protocol, TypeVar
@@ -179,7 +180,7 @@ class _Loop:
             done=self.cursor.step,
             details=self._details,
             live=not silent and sys.stdout.isatty() and sys.stderr.isatty(),
-            say=_print_nothing if silent else _print_line,
+            say=(lambda line: None) if silent else partial(print, flush=True),
         )
         with progress:
             while not self._finished():
@@ -308,10 +309,6 @@ def rate_factor(config: TrainingConfig, step: int) -> float:
     if done < WARMING:
         return done / WARMING
     return 0.5 * (1.0 + math.cos(math.pi * (done - WARMING) / (1.0 - WARMING)))
-
-
-def _print_line(line: str) -> None:
-    print(line, flush=True)
 
 
 def _print_nothing(_: str) -> None:
