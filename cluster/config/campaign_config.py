@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from collector.watchdog import Limits
 
 
+AbsolutePath = Annotated[Path, AfterValidator(lambda path: path.expanduser().resolve())]
+"""Of what is read again when a run is resumed, perhaps from another working folder."""
+
+
 class ObjectSelection(StrictModel):
     """Settings of task and objects; other settings inherit from it, so its flags have no prefix.
 
@@ -26,9 +30,9 @@ class ObjectSelection(StrictModel):
     """Which manipulation task: a name, or a TOML file that defines one."""
     task_definition: Annotated[Task | None, tyro.conf.Suppress] = Field(None, exclude_if=lambda task: task is None)
     """What the file said."""
-    objects: Path | None = None
+    objects: AbsolutePath | None = None
     """A folder of objects in PartNet-Mobility's layout; default: procedural objects."""
-    object_list: Path | None = None
+    object_list: AbsolutePath | None = None
     """Only the objects of this list, `<id> <category>` a line, such as Where2Act publishes."""
     categories: tuple[str, ...] = ()
     """Only objects of these; "train" and "test" stand for the paper's ten and five. Default: all."""
@@ -51,12 +55,6 @@ class ObjectSelection(StrictModel):
             return values | {"task": defined.name, "task_definition": defined}
         name = defined.get("name") if isinstance(defined, dict) else getattr(defined, "name", None)
         return values | {"task_definition": defined if name == task else None}
-
-    @field_validator("objects", "object_list")
-    @classmethod
-    def _absolute(cls, path: Path | None) -> Path | None:
-        """A run may be resumed from another working folder."""
-        return None if path is None else path.expanduser().resolve()
 
 
 def _without_credentials(address: str) -> str:
@@ -155,9 +153,9 @@ class SplitConfig(StrictModel):
     train: float = Field(0.7, gt=0, le=1)
     validation: float = Field(0.1, ge=0, le=1)
     test: float = Field(0.2, gt=0, le=1)
-    train_list: Path | None = None
+    train_list: AbsolutePath | None = None
     """A list of `<id> <category>` lines: train on these, and test on all others unless `test_list` says which."""
-    test_list: Path | None = None
+    test_list: AbsolutePath | None = None
     """Likewise: test on these, and train on all others unless `train_list` says which."""
     test_categories: tuple[str, ...] = ()
     """Test on these categories and train on all others; "test" stands for the paper's five."""
@@ -178,12 +176,6 @@ class SplitConfig(StrictModel):
         if self.test_categories and (self.train_list or self.test_list):
             raise ValueError("what is tested on is said by lists or by test_categories, not by both")
         return self
-
-    @field_validator("train_list", "test_list")
-    @classmethod
-    def _absolute(cls, path: Path | None) -> Path | None:
-        """A run may be resumed from another working folder."""
-        return None if path is None else path.expanduser().resolve()
 
 
 class ProceduralConfig(StrictModel):
