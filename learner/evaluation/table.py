@@ -97,7 +97,7 @@ class ObjectCounts:
         times, above, below, rows = SHARES[name]
         seen = np.flatnonzero(getattr(self, rows))
         over = times * np.asarray(getattr(self, above))[seen]
-        under = sum(np.asarray(getattr(self, column))[seen] for column in below)
+        under = np.sum([np.asarray(getattr(self, column))[seen] for column in below], axis=0)
         whole = float(over.sum() / under.sum()) if under.sum() else float("nan")
         return whole, *ratio_interval(over, under, seen)
 

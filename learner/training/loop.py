@@ -180,6 +180,7 @@ class _Loop:
             done=self.cursor.step,
             details=self._details,
             live=not silent and sys.stdout.isatty() and sys.stderr.isatty(),
+            # Where another process speaks for this one, nothing is said.
             say=(lambda line: None) if silent else partial(print, flush=True),
         )
         with progress:
@@ -309,10 +310,6 @@ def rate_factor(config: TrainingConfig, step: int) -> float:
     if done < WARMING:
         return done / WARMING
     return 0.5 * (1.0 + math.cos(math.pi * (done - WARMING) / (1.0 - WARMING)))
-
-
-def _print_nothing(_: str) -> None:
-    """Another process speaks for this one."""
 
 
 P = ParamSpec("P")
