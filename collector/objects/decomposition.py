@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from collector.objects.articulation import ArticulatedObject, Body, Mesh
-from collector.objects.bounds import check_bounds
+from collector.objects.articulation import ArticulatedObject, Body, Mesh, check_bounds
 from collector.objects.child_process import MAX_ENCODED_BYTES, ChildProcess, decode, encode
 from collector.objects.coacd_process import MAX_PIECES, SETTINGS
 from shared.errors import ObjectError, StoreError, UsageError

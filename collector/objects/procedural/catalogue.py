@@ -12,7 +12,7 @@ from collector.objects.procedural.appliances import (
     random_microwave,
     random_washing_machine,
 )
-from collector.objects.procedural.cabinets import random_refrigerator, random_safe
+from collector.objects.procedural.cabinets import random_refrigerator, random_safe, random_table_or_desk
 from collector.objects.procedural.containers import (
     random_box,
     random_bucket,
@@ -20,7 +20,6 @@ from collector.objects.procedural.containers import (
     random_kitchen_pot,
     random_trash_can,
 )
-from collector.objects.procedural.desks import random_table_or_desk
 from collector.objects.procedural.faucets import random_faucet
 from collector.objects.procedural.fitted import random_cabinet
 from collector.objects.procedural.openings import random_door, random_switch, random_window
