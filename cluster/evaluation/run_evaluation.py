@@ -191,14 +191,18 @@ def _evaluate(
         out=out,
         root=out if subject.root is None else subject.root,
     )
+    _execute(evaluation, settings)
+    for line in (out / MARKDOWN_FILE).read_text(encoding="utf-8").splitlines():
+        print(plain(line))
+    print(f"\n{out / RESULTS_FILE}")
+
+
+def _execute(evaluation: Evaluation, settings: EvaluateSettings) -> None:
     console = Console(file=sys.stderr, highlight=False)
     with worker_groups(settings.workers, settings.limits, settings.ray_address) as make_worker_group:
         evaluation.execute(
             CurrentWorkerGroup(make_worker_group), lambda line: console.print(line, markup=False, soft_wrap=True)
         )
-    for line in (out / MARKDOWN_FILE).read_text(encoding="utf-8").splitlines():
-        print(plain(line))
-    print(f"\n{out / RESULTS_FILE}")
 
 
 def _version(run: RunFolder, policies: Store, wanted: int | None) -> int:
