@@ -178,7 +178,8 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         raise UsageError("the runs share no method and budget; evaluate them alike")
     novel = tested[0].novel_categories
     rows = [_pooled(method, budget, results, novel) for method, budget in sorted(common, key=_place)]
-    prior, oracle = (_share_of(rows, method) for method in (PRIOR_METHOD, ORACLE_METHOD))
+    f_scores = {row.method: row.shares["f_score"][0] for row in reversed(rows)}
+    prior, oracle = (f_scores.get(method, math.nan) for method in (PRIOR_METHOD, ORACLE_METHOD))
     return Comparison(
         task=tasks[0],
         seeds=tuple(each.seed for each in results),
@@ -260,10 +261,6 @@ def _together(counts: Sequence[ObjectCounts]) -> ObjectCounts:
                 np.add.at(total, [numbers[own] for own in each.object], column)
             sums[name] = tuple(total.tolist())
     return ObjectCounts(object=tuple(names), **sums)
-
-
-def _share_of(rows: Sequence[PooledRow], method: str) -> float:
-    return next((row.shares["f_score"][0] for row in rows if row.method == method), math.nan)
 
 
 def write_comparison(out: Path, comparison: Comparison) -> None:
