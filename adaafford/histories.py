@@ -29,7 +29,7 @@ from adaafford.parts import FollowedPart, part_choice
 from adaafford.scans import ScanFrame, Vector, action_at
 from shared.config import StrictModel
 from shared.errors import UsageError
-from shared.io.documents import named_twice, reason_of
+from shared.io.documents import reason_of, refuse_twins
 from shared.io.files import read_bounded, remove_remnants, write_atomically, writing
 from shared.types import MAX_GRASP_WIDTH, Action, Interaction, Observation, Outcome, OutcomeKind
 
@@ -227,7 +227,7 @@ def parse_json(model: type[Model], data: bytes, source: str, remedy: str) -> Mod
         text = without_mark(data)
         found = model.model_validate_json(text)
         # Of a name that stands twice, pydantic takes the last.
-        json.loads(text, object_pairs_hook=_without_doubles)
+        json.loads(text, object_pairs_hook=refuse_twins)
     except ValidationError as error:
         problem = error.errors()[0]
         place = shown([".".join(map(str, problem["loc"]))]) if problem["loc"] else "the file"
@@ -235,11 +235,6 @@ def parse_json(model: type[Model], data: bytes, source: str, remedy: str) -> Mod
     except ValueError as error:
         raise UsageError(f"{source}{error}; {remedy}") from None
     return found
-
-
-def _without_doubles(pairs: list[tuple[str, object]]) -> None:
-    if (name := named_twice(pairs)) is not None:
-        raise ValueError(f"the name '{shown([name])}' occurs twice")
 
 
 def write_history(path: Path, history: History) -> None:

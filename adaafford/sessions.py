@@ -35,10 +35,10 @@ from adaafford.scans import (
 )
 from shared import seeds
 from shared.arms.arm import Arm
-from shared.arms.reach import ArmReach, reachable_points
+from shared.arms.kinematics import ArmReach, reachable_points
 from shared.config import Name, StrictModel
 from shared.errors import UsageError
-from shared.io.files import create_exclusively
+from shared.io.files import create_exclusively, writing
 from shared.io.text import plain
 from shared.policies.adaptation import Adapter
 from shared.policies.methods import PROPOSERS
@@ -415,11 +415,9 @@ class Session:
         selection = self._selection if at is None else self._selection.model_copy(update={"at": at})
         data, line = take_scan(recording, selection)
         cloud = self._files.history.parent / f"{recording.stem}-{hashlib.sha256(data).hexdigest()[:12]}.npz"
-        try:
+        with writing(cloud, "put the history elsewhere"):
             if create_exclusively(cloud, data):
                 self._tell(f"{recording}: {line}, was written to {cloud}")
-        except OSError as error:
-            raise UsageError(f"{cloud}: cannot be written ({error.strerror}); put the history elsewhere") from None
         return cloud
 
     def _name_of(self, cloud: Path) -> str:

@@ -25,7 +25,7 @@ from benchmarks.listing import ListingBenchmark, StorePoint
 from benchmarks.script import check_picture, main
 from benchmarks.sleeping import Dormitories, Sleeper
 from cluster.cli.commands.bench import StoredSettings, source_of, stored
-from cluster.collection.tally import CollectionProgress
+from cluster.collection.status_writer import CollectionProgress
 from cluster.workers.job_queue import RolloutQueue
 from cluster.workers.ray_group import RayWorkerGroup
 from cluster.workers.session import ray_session

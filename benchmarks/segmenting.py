@@ -29,7 +29,7 @@ from benchmarks.script import main
 from cluster.cli.commands.bench import BenchSettings
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import load, of_categories, scan
-from collector.sim.raw_scan import RawScan, random_scan
+from collector.scenes import RawScan, random_scan
 from shared import seeds
 from shared.errors import UsageError
 from shared.io.files import make_folder

@@ -1,47 +1,44 @@
-"""Rollouts: one object, one draw of hidden dynamics, one camera, and a sequence of interactions.
+"""Rollouts: one object, one draw of hidden dynamics, one camera, and a sequence of interactions that are recorded.
 
 A rollout is a pure function of its plan and its number: object, hidden dynamics, camera, states and actions are drawn
 from seeds that are derived from these. So it is the same for every worker and at any time.
 """
 
-from dataclasses import dataclass, replace
-from typing import Protocol
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from collector.method_trials import ProposerFactory, evaluate
 from collector.objects.articulation import ArticulatedObject, surface_at
 from collector.random_proposer import RandomProposer
-from collector.recorder import Recorder
-from collector.sim.armed import ArmedEnvironment
+from collector.sim.environment import ArmedEnvironment
 from collector.sim.simulator import SIMULATORS, SimEnvironment, StageClock
 from shared import seeds
 from shared.config import DynamicsRanges, Range
-from shared.geometry import camera_pose
+from shared.geometry import camera_pose, quaternion_from_rotation
 from shared.hidden import ALWAYS_DRAWN
-from shared.plan import ObjectRef, Plan, RolloutRecord, RolloutStatus
-from shared.policies.methods import METHODS, REPEATING, MethodName
+from shared.plan import InteractionRecord, ObjectRef, Plan, RolloutRecord, RolloutStatus
+from shared.primitives import hand_start
 from shared.tasks import Task
-from shared.types import Float, HiddenDynamics, Interaction, Order, Proposer, Role
+from shared.types import (
+    Action,
+    Float,
+    HiddenDynamics,
+    Interaction,
+    Observation,
+    Order,
+    Outcome,
+    OutcomeKind,
+    Proposer,
+    Role,
+)
 
 TRIES = 8
 """Draws of a camera and a state before a rollout is given up as showing nothing that could be acted upon."""
 ARM_DISTANCE, ARM_ASIDE, ARM_TURN = (0.3, 0.6), 0.3, 0.2
 """Of the base of an arm: how far before the object's front, and aside of its middle, m, and turned off it, rad."""
-
-
-class ProposerFactory(Protocol):
-    """Makes proposers."""
-
-    def __call__(self, name: str, rng: np.random.Generator, version: int, share: float | None = None, /) -> Proposer:
-        """Make a proposer.
-
-        Args:
-            name: of the proposer, such as "aip".
-            rng: of its random draws.
-            version: of the policy.
-            share: of a cloud's points, from which it draws its points, as far as it draws any; None: its own way.
-        """
-        ...
 
 
 def run_rollout(
@@ -201,6 +198,153 @@ def make_environment(
     return environment if arm is None else ArmedEnvironment(environment, arm, base, setting.collection.arm_known, clock)
 
 
+def interact(
+    environment: SimEnvironment,
+    proposer: Proposer,
+    most: int,
+    *,
+    history: Sequence[Interaction] = (),
+    start: Float | None = None,
+    execute: Callable[[Observation, Action], Outcome] | None = None,
+    clock: StageClock | None = None,
+) -> Iterator[Interaction]:
+    """The paper's test-time loop: observe, propose, execute, extend the history.
+
+    It ends after `most` interactions, or earlier if the proposer stops, if no point that the task may act on is visible
+    (a part can move out of the camera's view), or if the simulation has diverged.
+
+    Args:
+        environment: to act in.
+        proposer: chooses the actions.
+        most: number of interactions.
+        history: earlier interactions; the proposer receives these and those of this loop.
+        start: [parts], a state that is restored before each interaction; None: each continues from the last.
+        execute: executes an action instead of the environment, so that the caller can record it.
+        clock: sums wall time by stage.
+    """
+    clock = clock or StageClock()
+    known = list(history)
+    for _ in range(most):
+        if start is not None:
+            environment.restore(start)
+        observation = environment.observe()
+        if not observation.movable.any():
+            return
+        with clock.stage("propose"):
+            action = proposer.propose(observation, known)
+        if action is None:
+            return
+        outcome = execute(observation, action) if execute else environment.execute(action)
+        known.append(Interaction(observation, action, outcome))
+        yield known[-1]
+        if outcome.kind is OutcomeKind.UNSTABLE:
+            return  # Later states of this scene are not valid.
+
+
+@dataclass(slots=True)
+class Recorder:
+    """Records what a rollout does: interactions in order, and every observation once."""
+
+    environment: SimEnvironment
+    policy_version: int
+    clock: StageClock
+    observations: list[Observation] = field(default_factory=list)
+    interactions: list[InteractionRecord] = field(default_factory=list)
+
+    def interact(
+        self,
+        proposer: Proposer,
+        most: int,
+        role: Role,
+        *,
+        history: Sequence[Interaction] = (),
+        start: Float | None = None,
+        method: str = "",
+        budget: int = -1,
+    ) -> list[Interaction]:
+        """Run the loop and write down every interaction; see the function `interact`.
+
+        Args:
+            proposer: chooses the actions.
+            most: interactions.
+            role: what the interactions are for.
+            history: interactions that the proposer knows already.
+            start: [parts], a state that is put back before each interaction. None: each continues from the last.
+            method: whose interactions these are, in evaluation.
+            budget: how many interactions the method had before, in evaluation.
+
+        Returns:
+            The interactions of this loop.
+        """
+        order = Order.CONTINUE if start is None else Order.RESTART
+
+        def execute(observation: Observation, action: Action) -> Outcome:
+            return self._execute(observation, action, proposer.name, order, role, method, budget)
+
+        loop = interact(
+            self.environment, proposer, most, history=history, start=start, execute=execute, clock=self.clock
+        )
+        return list(loop)
+
+    @property
+    def sound(self) -> bool:
+        """Whether the simulation has not diverged; nothing that follows could be believed."""
+        return not self.interactions or self.interactions[-1].outcome.kind is not OutcomeKind.UNSTABLE
+
+    def _execute(
+        self,
+        observation: Observation,
+        action: Action,
+        proposer: str,
+        order: Order,
+        role: Role,
+        method: str,
+        budget: int,
+    ) -> Outcome:
+        """Execute an action and record the interaction."""
+        environment = self.environment
+        part = int(observation.part_ids[action.point_index])
+        body = environment.object.bodies[part]
+        assert body.joint is not None
+        state = environment.privileged(part)
+        begun = time.perf_counter()
+        outcome = environment.execute(action)
+        self.interactions.append(
+            InteractionRecord(
+                step=len(self.interactions),
+                observation=self._place_of(observation),
+                action=action,
+                outcome=outcome,
+                normal=observation.normals[action.point_index].astype(np.float64),
+                primitive=environment.primitive,
+                order=order,
+                role=role,
+                proposer=proposer,
+                policy_version=0 if proposer == RandomProposer.name else self.policy_version,
+                method=method,
+                budget=budget,
+                target_part=part,
+                target_link=body.link,
+                target_joint=body.joint.name,
+                joint_names=tuple(each.joint.name for each in environment.object.parts if each.joint is not None),
+                joint_positions=state.joint_positions,
+                joint_limits=state.joint_limits,
+                joint_twist=state.joint_twist,
+                hand_start=np.concatenate([hand_start(action), quaternion_from_rotation(action.rotation)]),
+                seconds=time.perf_counter() - begun,
+            )
+        )
+        return outcome
+
+    def _place_of(self, observation: Observation) -> int:
+        """Where the observation is kept; a new one is added."""
+        for place, kept in enumerate(self.observations):
+            if kept is observation:
+                return place
+        self.observations.append(observation)
+        return len(self.observations) - 1
+
+
 def collect(
     plan: Plan, index: int, recorder: Recorder, states: np.random.Generator, make_proposer: ProposerFactory
 ) -> None:
@@ -249,97 +393,3 @@ def _record(
         interactions=tuple(recorder.interactions) if recorder else (),
         arm_base=arm_base,
     )
-
-
-def evaluate(plan: Plan, index: int, recorder: Recorder, make_proposer: ProposerFactory) -> None:
-    """Run every method of the plan on the environment's present state.
-
-    Args:
-        plan: an evaluation plan.
-        index: number of the rollout.
-        recorder: of the environment, in its start state.
-        make_proposer: makes the proposers that the methods name.
-    """
-    config = plan.setting.evaluation
-    assert config is not None, "an evaluation setting says what to evaluate"
-
-    def rng(purpose: str) -> np.random.Generator:
-        return seeds.generator(plan.setting.seed, f"{purpose}/{plan.key}", index)
-
-    environment = recorder.environment
-    edge_share = plan.setting.terms.edge_share
-    start = environment.state()
-    recorder.interact(RandomProposer(rng("queries"), edge_share), config.queries, Role.QUERY, start=start)
-    if recorder.sound:
-        environment.restore(start)
-    tried: dict[MethodName, list[Interaction]] = {}
-    for name in config.methods:
-        if not recorder.sound:
-            return
-        environment.restore(start)
-        method = METHODS.get(name)
-        version = method.policy_version(plan.policy_version)
-        recorder.policy_version = version
-        exploiter = make_proposer(method.critic, rng(f"exploit/{name}"), version)
-        context: Proposer | None = None
-        if method.tries == RandomProposer.name:
-            context = RandomProposer(rng(f"context/{name}"), edge_share)
-        elif method.tries is not None:
-            context = make_proposer(method.tries, rng(f"context/{name}"), version)
-        tried[name] = _adapt(recorder, name, context, exploiter, method.budgets(config.budgets), start)
-
-    def act_at_start(role: Role, name: MethodName, history: list[Interaction], proposer: Proposer) -> None:
-        """At each budget, execute what the method would do after its first interactions, where they began."""
-        for budget in METHODS.get(name).budgets(config.budgets):
-            if not recorder.sound:
-                return
-            known = history[:budget]
-            recorder.interact(proposer, 1, role, history=known, start=start, method=name, budget=budget)
-
-    for name, history in tried.items() if config.exploit_share is not None else ():
-        method = METHODS.get(name)
-        version = recorder.policy_version = method.policy_version(plan.policy_version)
-        if method.draws_tries and recorder.sound:
-            environment.restore(start)
-            context = make_proposer(str(method.tries), rng(f"context-by-share/{name}"), version, config.exploit_share)
-            most = method.budgets(config.budgets)[-1]
-            history = recorder.interact(context, most, Role.CONTEXT_BY_SHARE, method=name)
-        exploiter = make_proposer(method.critic, rng(f"exploit-by-share/{name}"), version, config.exploit_share)
-        act_at_start(Role.EXPLOIT_BY_SHARE, name, history, exploiter)
-    for name, history in tried.items() if config.repeats else ():
-        method = METHODS.get(name)
-        if method.tries is not None:
-            version = recorder.policy_version = method.policy_version(plan.policy_version)
-            critic = f"{REPEATING}{method.critic}"
-            repeater = make_proposer(critic, rng(f"repeat/{name}"), version, config.exploit_share)
-            act_at_start(Role.REPEAT_AT_START, name, history, repeater)
-
-
-def _adapt(
-    recorder: Recorder,
-    method: str,
-    context: Proposer | None,
-    exploiter: Proposer,
-    budgets: list[int],
-    start: Float,
-) -> list[Interaction]:
-    """Collect the method's interactions one at a time; at each budget, execute its action and restore the state.
-
-    Returns:
-        The interactions.
-    """
-    environment, history = recorder.environment, list[Interaction]()
-    for budget in budgets:
-        if context is not None:  # A proposer may stop before the greater budgets.
-            left_to_try = budget - len(history)
-            history += recorder.interact(context, left_to_try, Role.CONTEXT, history=history, method=method)
-        if not recorder.sound or not environment.observe().movable.any():
-            return history
-        left = environment.state()
-        # Without interactions, both states are the same.
-        for role, state in ((Role.EXPLOIT, left), (Role.EXPLOIT_AT_START, start))[: 1 if context is None else 2]:
-            recorder.interact(exploiter, 1, role, history=history, start=state, method=method, budget=budget)
-            if not recorder.sound:
-                return history
-        environment.restore(left)
-    return history

@@ -20,7 +20,7 @@ from collector.rollout import object_of, quarantined_rollout, run_rollout
 from collector.setting import check_packages
 from collector.sim.simulator import StageClock
 from collector.watchdog import UnderWay
-from shared.io.redaction import without_places
+from shared.io.text import without_places
 from shared.plan import Job, Plan, RolloutRecord, RolloutStatus
 from shared.policies.methods import PROPOSERS, needs_policy
 from shared.store import Quarantined, Store

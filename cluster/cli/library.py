@@ -11,8 +11,7 @@ from shared.extras import require, require_packages
 from shared.policies.methods import BASELINES
 from shared.policies.policy import Policy
 from shared.store import Store
-from shared.store.clouds import check_fields
-from shared.store.selection import Condition
+from shared.store.selection import Condition, check_fields
 from shared.tasks import task_of
 
 if TYPE_CHECKING:

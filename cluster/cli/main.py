@@ -19,8 +19,7 @@ from cluster.runs.streams import Streams, configure
 from shared.errors import AdaAffordError, UsageError
 from shared.extras import extra_of, missing_line, require
 from shared.interrupts import ENDING, heeded
-from shared.io.redaction import without_secrets
-from shared.io.text import plain
+from shared.io.text import plain, without_secrets
 
 logger = logging.getLogger(__name__)
 

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cluster.collection.status_writer import DriverStatus, State, status_kept
-from cluster.collection.tally import CollectionProgress, Tally, describe_empty
+from cluster.collection.status_writer import CollectionProgress, DriverStatus, State, Tally, describe_empty, status_kept
 from cluster.workers.job_queue import PolicySource, RolloutQueue
 from cluster.workers.retries import JobError
 from cluster.workers.worker_group import WorkerGroup

@@ -4,8 +4,7 @@ import logging
 from collections.abc import Iterable
 from pathlib import Path
 
-from cluster.config.campaign_config import SplitConfig
-from cluster.config.command_settings import ObjectSelection
+from cluster.config.campaign_config import ObjectSelection, SplitConfig
 from collector.objects.catalogue import Catalogue, ObjectSplit, for_task, of_categories, read_list, scan, split
 from collector.objects.procedural.catalogue import EVERY_CATEGORY, categories_of, generate
 from shared.errors import UsageError
@@ -49,8 +48,11 @@ def objects_for(
     if not catalogue.usable:
         why = f"; the first: {catalogue.refused[0][0]}: {catalogue.refused[0][1]}" if catalogue.refused else ""
         raise UsageError(f"{folder}: none of {len(catalogue.refused)} objects suits the task '{task.name}'{why}")
-    _say_refused(found)
-    _say_notes(catalogue)
+    # Those that are of no use for this task are as expected.
+    refused = [f"object {object_id} cannot be used: {reason}" for object_id, reason in found.refused]
+    _say(refused, "more objects cannot be used; `adaafford objects check` says why")
+    notes = [f"object {entry.ref.id}: {'; '.join(entry.notes)}" for entry in catalogue.usable if entry.notes]
+    _say(notes, "more objects have something left out; `adaafford objects check` says what")
     return catalogue, folder
 
 
@@ -67,18 +69,6 @@ def require_same_objects(wanted: Iterable[ObjectRef], folder: Path) -> None:
             f"{folder}: {len(missing)} of the objects wanted are not there or have other content, such as "
             f"{short(missing[0])}; name the folder that holds the same files"
         )
-
-
-def _say_refused(found: Catalogue) -> None:
-    """Say which objects cannot be used for any task; that others are of no use for this one is as expected."""
-    lines = [f"object {object_id} cannot be used: {reason}" for object_id, reason in found.refused]
-    _say(lines, "more objects cannot be used; `adaafford objects check` says why")
-
-
-def _say_notes(catalogue: Catalogue) -> None:
-    """Say which objects are not used as their files have them."""
-    lines = [f"object {entry.ref.id}: {'; '.join(entry.notes)}" for entry in catalogue.usable if entry.notes]
-    _say(lines, "more objects have something left out; `adaafford objects check` says what")
 
 
 def _say(lines: list[str], others: str) -> None:

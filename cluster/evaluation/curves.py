@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -161,7 +160,10 @@ def draw_curves(curves: Curves, path: Path) -> None:
                     tries, [getattr(row, figure_name) for row in made], line, color=colour, marker=marker, label=label
                 )
                 axes.fill_between(tries, low, high, color=colour, alpha=0.12, linewidth=0)
-    _bounds(left, [row for row in pooled if row.name == names[0]])
+    for row in pooled:
+        if row.name == names[0] and row.critic in ("where2act", "oracle"):  # Level lines.
+            colour = "0.5" if row.critic == "where2act" else "black"
+            left.axhline(row.f_score, color=colour, linewidth=1, label=CRITICS[row.critic])
     right.axhline(0.0, color="0.5", linewidth=1)
     right.axhline(1.0, color="black", linewidth=1)
     left.set_ylabel("F-score at threshold 0.5")
@@ -172,11 +174,3 @@ def draw_curves(curves: Curves, path: Path) -> None:
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle(f"{curves.task}: {pooled[0].objects} objects not seen in training", fontsize=10)
     figure.savefig(path, format="png")
-
-
-def _bounds(axes: Axes, rows: Sequence[CurveRow]) -> None:
-    """Where2Act and the oracle as level lines."""
-    for row in rows:
-        if row.critic in ("where2act", "oracle"):
-            colour = "0.5" if row.critic == "where2act" else "black"
-            axes.axhline(row.f_score, color=colour, linewidth=1, label=CRITICS[row.critic])

@@ -11,8 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from adaafford.pretrained import load_policy
-from cluster.config.campaign_config import CampaignConfig
-from cluster.config.command_settings import EvaluateSettings
+from cluster.config.campaign_config import CampaignConfig, EvaluateSettings
 from cluster.config.objects import objects_for
 from cluster.evaluation.evaluate import Evaluation
 from cluster.evaluation.tables import MARKDOWN_FILE, RESULTS_FILE

@@ -178,7 +178,8 @@ def pool(runs: Sequence[Path], evaluation: str | None) -> Comparison:
         raise UsageError("the runs share no method and budget; evaluate them alike")
     novel = tested[0].novel_categories
     rows = [_pooled(method, budget, results, novel) for method, budget in sorted(common, key=_place)]
-    prior, oracle = (_share_of(rows, method) for method in (PRIOR_METHOD, ORACLE_METHOD))
+    f_scores = {row.method: row.shares["f_score"][0] for row in reversed(rows)}
+    prior, oracle = (f_scores.get(method, math.nan) for method in (PRIOR_METHOD, ORACLE_METHOD))
     return Comparison(
         task=tasks[0],
         seeds=tuple(each.seed for each in results),
@@ -223,7 +224,11 @@ def _pooled(method: str, budget: int, results: Sequence[_Results], novel_categor
     task = results[0].task
     rows = [next(row for row in each.rows if (row.method, row.budget) == (method, budget)) for each in results]
     counts = [row.counts for row in rows]
-    together = _together([_by_content(each, contents.contents) for each, contents in zip(counts, results, strict=True)])
+    # Objects are called by what they are, because runs call other objects the same.
+    called = [
+        tuple(of.contents.get(name, name) for name in each.object) for each, of in zip(counts, results, strict=True)
+    ]
+    together = _together([replace(each, object=names) for each, names in zip(counts, called, strict=True)])
     averages = {}
     for name in AVERAGED:
         known = [value for row in rows if (value := getattr(row, name)) is not None]
@@ -231,8 +236,8 @@ def _pooled(method: str, budget: int, results: Sequence[_Results], novel_categor
     return PooledRow(
         method=method,
         budget=budget,
-        shares={name: getattr(together, name)() for name in _ALL_MEASURES},
-        by_run={name: tuple(getattr(each, name)()[0] for each in counts) for name in _ALL_MEASURES},
+        shares={name: together.share(name) for name in _ALL_MEASURES},
+        by_run={name: tuple(each.share(name)[0] for each in counts) for name in _ALL_MEASURES},
         paper={
             measure: published_figure(task, method, budget, measure, novel_categories=novel_categories)
             for measure in PUBLISHED_MEASURES
@@ -241,11 +246,6 @@ def _pooled(method: str, budget: int, results: Sequence[_Results], novel_categor
         trials=sum(together.trials),
         averages=averages,
     )
-
-
-def _by_content(counts: ObjectCounts, contents: Mapping[str, str]) -> ObjectCounts:
-    """With objects called by what they are."""
-    return replace(counts, object=tuple(contents.get(name, name) for name in counts.object))
 
 
 def _together(counts: Sequence[ObjectCounts]) -> ObjectCounts:
@@ -261,10 +261,6 @@ def _together(counts: Sequence[ObjectCounts]) -> ObjectCounts:
                 np.add.at(total, [numbers[own] for own in each.object], column)
             sums[name] = tuple(total.tolist())
     return ObjectCounts(object=tuple(names), **sums)
-
-
-def _share_of(rows: Sequence[PooledRow], method: str) -> float:
-    return next((row.shares["f_score"][0] for row in rows if row.method == method), math.nan)
 
 
 def write_comparison(out: Path, comparison: Comparison) -> None:

@@ -129,7 +129,7 @@ def _outcomes(summary: Summary) -> Drawing:
     )
     figure.add_trace(
         go.Bar(
-            x=[_bin_name(each["low"], each["high"]) for each in bins],
+            x=[f"≥ {b['low']:g}" if b["high"] is None else f"{b['low']:g} to {b['high']:g}" for b in bins],
             y=[each["count"] for each in bins],
             marker={"color": [ACCENT if each["low"] >= 0.01 else "#c3c9d0" for each in bins]},
             hovertemplate="%{x}: %{y:,}<extra></extra>",
@@ -190,7 +190,3 @@ def _refused(refused: Sequence[Mapping[str, str]]) -> Table:
         for each in refused[:MAX_ROWS]
     )
     return Table((head,), body, f"Refused objects: {len(refused)}, here {len(body)}", folded=True)
-
-
-def _bin_name(low: float, high: float | None) -> str:
-    return f"≥ {low:g}" if high is None else f"{low:g} to {high:g}"

@@ -17,12 +17,12 @@ from cluster.reporting.page import Drawing, Section, plain, shortened
 from cluster.reporting.style import after, number, turning
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import load_ref
-from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import storage_furniture
+from collector.objects.procedural.shapes import normalised
 from collector.objects.readers import read_object
 from collector.objects.writing import write_object
 from collector.random_proposer import RepeatingProposer
-from collector.recorder import interact
+from collector.rollout import interact
 from collector.sim.environment import SapienEnvironment
 from collector.sim.simulator import StageClock
 from shared import seeds

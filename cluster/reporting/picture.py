@@ -10,8 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from cluster.evaluation.trials import first_trials, most_telling
 from cluster.reporting.style import hidden, verdict
+from cluster.reporting.trial_sections import first_trials, most_telling
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
 from shared.store import Store

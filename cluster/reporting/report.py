@@ -3,7 +3,7 @@
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,19 @@ from rich.table import Table
 
 from cluster.config.campaign_config import CampaignConfig
 from cluster.evaluation.tables import RESULTS_FILE
+from cluster.reporting.collecting import collection_section
+from cluster.reporting.page import Page, Picture, Section, render, shortened
+from cluster.reporting.picture import draw_adaptation
+from cluster.reporting.results import Results, further_section, read_results, results_section, tiles
+from cluster.reporting.training import training_section
+from cluster.reporting.trial_sections import failures_section, first_trials, most_telling, proposals_section
 from cluster.runs.run_folder import RunFolder, read_json
 from cluster.runs.run_log import RunLog
 from shared.errors import UsageError
 from shared.formatting import terminal_table
-from shared.io.files import write_atomically
+from shared.io.files import read_bounded, scratch_folder, write_atomically
 from shared.io.text import plain
+from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
 from shared.software import software_versions
 from shared.store import Store
@@ -31,8 +38,11 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
     Args:
         run: a run that was evaluated.
         config: its configuration.
-        experiments: whether to simulate other hidden facts for the page.
+        experiments: whether to simulate other hidden facts for the page, which takes some more seconds.
         say: receives a line for each step.
+
+    Raises:
+        StoreError: a file of the run is damaged or foreign.
     """
     run_log, store = RunLog(run.log), Store.open(run.store)
     used = run.objects_used()
@@ -58,12 +68,31 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
         "earlier_software": _earlier_software(run, run_log),
     }
     write_atomically(run.summary, json.dumps(summary, indent=1, allow_nan=False).encode())
-    # Matplotlib and plotly take a while to import, so only here.
-    from cluster.reporting.picture import draw_adaptation
-    from cluster.reporting.writing import write_page
-
-    draw_adaptation(Store.open(run.evaluation), Policy.from_files(store.read_policy(versions[-1])), run.picture)
-    write_page(run, config, experiments=experiments, say=say)
+    evaluation, policy = Store.open(run.evaluation), Policy.from_files(store.read_policy(versions[-1]))
+    draw_adaptation(evaluation, policy, run.picture)
+    adapter, found = Adapter(policy), first_trials(evaluation)
+    say("drawing tables, curves and clouds")
+    novel = run.are_novel(used.test)
+    results = read_results(run.training("evaluate") / RESULTS_FILE, config.task, novel_categories=novel)
+    further = _further(run)
+    sections = [
+        *([_picture(run.picture)] if run.picture.is_file() else []),
+        results_section(results),
+        *([further_section(further)] if further else []),
+        proposals_section(most_telling(found, adapter), adapter),
+        _hidden_facts(run, evaluation, adapter, say) if experiments else _not_tried(run),
+        failures_section(found, adapter),
+        training_section(run.trainings, list(run_log.seconds)),
+        collection_section(summary, store, run_log),
+    ]
+    page = Page(
+        title=f"AdaAfford: {config.task}",
+        subtitle=_subtitle(summary, config, results),
+        tiles=tiles(results),
+        sections=tuple(sections),
+        facts=_facts(summary, run),
+    )
+    write_atomically(run.page, render(page).encode())
 
 
 def print_report(run: RunFolder) -> None:
@@ -185,3 +214,69 @@ def _histogram(motions: list[float]) -> list[dict[str, Any]]:
         {"low": low, "high": high, "count": int(count)}
         for low, high, count in zip(MOTION_EDGES[:-1], highs, counts, strict=True)
     ]
+
+
+MAX_PICTURE_BYTES = 4 << 20
+MAX_FURTHER = 20
+"""Evaluations beside the run's own that are shown."""
+
+
+def _further(run: RunFolder) -> list[tuple[str, Results]]:
+    """What `adaafford evaluate` made of the run, by name, as far as it is finished."""
+    found = []
+    for path in sorted(run.evaluations.glob(f"*/{RESULTS_FILE}"))[:MAX_FURTHER]:
+        novel = run.are_novel(Store.open(path.parent / "store").setting.objects)
+        found.append((path.parent.name, read_results(path, novel_categories=novel)))
+    return found
+
+
+def _hidden_facts(run: RunFolder, evaluation: Store, adapter: Adapter, say: Callable[[str], None]) -> Section:
+    # Only here, since they need the simulator.
+    from cluster.reporting.counterfactuals import Counterfactuals, first_readable, hidden_facts_section, hinge_twins
+
+    used, setting = run.objects_used(), evaluation.setting
+    try:
+        setting.dynamics.check_known()
+        target = first_readable(run.objects_folder(), used.test, setting)
+    except UsageError as error:
+        say(str(error))
+        return _not_tried(run)
+    with scratch_folder("report") as folder:
+        return hidden_facts_section(Counterfactuals(setting, adapter), target, hinge_twins(setting, folder), say)
+
+
+def _not_tried(run: RunFolder) -> Section:
+    name = run.path.resolve().name
+    how = f"Made by `adaafford report {name}`, which simulates test objects with other hidden facts."
+    return Section("hidden-facts", "Affordance under hidden facts", (how,))
+
+
+def _picture(path: Path) -> Section:
+    caption = "Affordance before and after each interaction, as the camera sees it."
+    picture = Picture(read_bounded(path, MAX_PICTURE_BYTES), caption)
+    return Section("glance", "At a glance", pictures=(picture,))
+
+
+def _subtitle(summary: Mapping[str, Any], config: CampaignConfig, results: Results) -> str:
+    objects = summary["objects"]
+    minutes = summary["wall_seconds"] / 60
+    workers = f"{config.workers} worker{'' if config.workers == 1 else 's'}"
+    return (
+        f"Affordance that adapts to one object after a few interactions: {summary['interactions']:,} interactions with "
+        f"{len(objects['train'])} objects, evaluated on {results.objects} others, in {minutes:.0f} minutes "
+        f"(seed {config.seed}, {workers})."
+    )
+
+
+def _facts(summary: Mapping[str, Any], run: RunFolder) -> tuple[tuple[str, str], ...]:
+    return (
+        ("run", run.path.resolve().name),
+        ("objects", shortened(summary["objects"]["folder"])),
+        ("store digest", summary["store_digest"]),
+        ("software", _versions(summary["software"])),
+        *(("earlier software", _versions(each)) for each in summary["earlier_software"]),
+    )
+
+
+def _versions(software: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {version}" for name, version in software.items())

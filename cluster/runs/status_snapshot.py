@@ -16,7 +16,7 @@ from cluster.runs.run_log import RunLog
 from learner.settings import METRICS_FILE, PUBLISHED_FILE
 from shared.errors import UsageError
 from shared.io.documents import json_lines
-from shared.plan import Job, covered
+from shared.plan import covered
 from shared.store import Store
 from shared.store.backends.base import is_url
 from shared.store.layout import SHARDS_FOLDER, STORE_FILE, parse_shard_id
@@ -164,13 +164,9 @@ def _store(where: str, now: float) -> StoreSnapshot:
 def _rollouts(store: Store) -> dict[str, int]:
     """Rollouts by plan, by the names of the shards alone: that a million of them are listed is work enough."""
     ranges: dict[str, list[tuple[int, int]]] = {}
-    for job in _jobs(store):
+    for job in filter(None, map(parse_shard_id, store.backend.names(SHARDS_FOLDER))):
         ranges.setdefault(job.plan_key, []).append((job.start, job.stop))
     return {plan_key: covered(known) for plan_key, known in sorted(ranges.items())}
-
-
-def _jobs(store: Store) -> Iterable[Job]:
-    return filter(None, map(parse_shard_id, store.backend.names(SHARDS_FOLDER)))
 
 
 def _training(files: Iterable[Path]) -> TrainingSnapshot | None:

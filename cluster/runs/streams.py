@@ -25,8 +25,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, TextIO
 
-from shared.io.redaction import without_secrets
-from shared.io.text import plain
+from shared.io.text import plain, without_secrets
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer

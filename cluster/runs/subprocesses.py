@@ -18,7 +18,7 @@ from typing import Any
 from learner.settings import OUTPUT_FILE
 from shared.errors import UsageError, WorkerError
 from shared.io.interpreter import PYTHON, own_environment
-from shared.io.redaction import without_places
+from shared.io.text import without_places
 
 THREADS = 2
 """Of torch, in a child: the collectors rest while it works."""

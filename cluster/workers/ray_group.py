@@ -2,6 +2,17 @@
 
 The driver's cost of a shard does not depend on the number of actors: answers arrive by callbacks, so nothing polls all
 actors, and slots are queued by state (`cluster.workers.slots`).
+
+Prometheus metrics go through Ray's own exporter (in its full installation, `ray[default]`). Labels are few and fixed:
+task, proposer, outcome, stage, cause. None is ever an object, a rollout, a shard or a worker, of which there are
+millions.
+
+    ray_adaafford_rollouts_total, ray_adaafford_quarantined_total           {task, proposer}
+    ray_adaafford_interactions_total                                        {task, proposer, outcome}
+    ray_adaafford_successes_total                                           {task, proposer}
+    ray_adaafford_worker_seconds_total                                      {task, proposer, stage}
+    ray_adaafford_restarts_total                                            {cause}: fault, loss, growth
+    ray_adaafford_workers, ray_adaafford_policy                             gauges
 """
 
 import logging
@@ -12,13 +23,13 @@ from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from queue import Empty, SimpleQueue
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import ray
 from ray.exceptions import RayError, RayTaskError
+from ray.util.metrics import Counter, Gauge
 
 from cluster.workers.job_queue import JobQueue, PlannedJob
-from cluster.workers.metrics import Cause, WorkerMetrics
 from cluster.workers.retries import Failure, RetryPolicy, RetryQueue, of_environment
 from cluster.workers.slots import Slot, Slots, Task
 from cluster.workers.worker_group import WAIT_S, WorkerGroup
@@ -43,6 +54,8 @@ NODE_S = 2.0
 """How often the driver checks, while actors start, that its own node is alive; without the node none can start."""
 LOOK_S = 0.1
 """How long each search for hung actors may take: a heartbeat in a bucket costs a request."""
+Cause = Literal["fault", "loss", "growth"]
+"""Why a worker was replaced: of a rollout's making, killed from outside, or grown too large."""
 
 logger = logging.getLogger(__name__)
 
@@ -361,3 +374,44 @@ def _require_own_node() -> None:
         raise WorkerError("Ray's process on this machine (its raylet) has died; run the same command again") from None
     except OSError:  # It is too busy to answer, say.
         return
+
+
+class WorkerMetrics:
+    """Counters of one driver, which start at 0 with its process, as Prometheus expects."""
+
+    def __init__(self, workers: int) -> None:
+        of_plan = ("task", "proposer")
+        self._rollouts = Counter("adaafford_rollouts", "Rollouts committed.", of_plan)
+        self._quarantined = Counter("adaafford_quarantined", "Rollouts given up.", of_plan)
+        self._interactions = Counter("adaafford_interactions", "Interactions by outcome.", (*of_plan, "outcome"))
+        self._successes = Counter("adaafford_successes", "Interactions that succeeded.", of_plan)
+        self._seconds = Counter("adaafford_worker_seconds", "What workers spend their time on.", (*of_plan, "stage"))
+        self._restarts = Counter("adaafford_restarts", "Workers that were replaced.", ("cause",))
+        self._policy = Gauge("adaafford_policy", "Version of the policy of the last shard.", of_plan)
+        self._workers = Gauge("adaafford_workers", "Workers that the driver keeps busy.")
+        self._workers.set(workers)
+
+    def add(self, plan: Plan, job_result: JobResult) -> None:
+        """Count a shard."""
+        tags = {"task": plan.setting.task, "proposer": plan.proposer}
+        for counter, amount in (
+            (self._rollouts, job_result.rollouts),
+            (self._quarantined, job_result.quarantined),
+            (self._successes, job_result.successes),
+        ):
+            _increase(counter, amount, tags)
+        for outcome, count in job_result.outcomes.items():
+            _increase(self._interactions, count, {**tags, "outcome": outcome})
+        for stage, seconds in job_result.seconds.items():
+            _increase(self._seconds, seconds, {**tags, "stage": stage})
+        self._policy.set(plan.policy_version, tags)
+
+    def replaced(self, cause: Cause) -> None:
+        """Count a worker that was replaced."""
+        self._restarts.inc(1, {"cause": cause})
+
+
+def _increase(counter: Counter, amount: float, tags: dict[str, str]) -> None:
+    # Ray refuses to increase a counter by nothing.
+    if amount > 0:
+        counter.inc(amount, tags)

@@ -18,8 +18,7 @@ from dataclasses import dataclass
 
 from cluster.workers.job_queue import JobQueue, PlannedJob
 from shared.errors import WorkerError
-from shared.io.redaction import without_secrets
-from shared.io.text import plain
+from shared.io.text import plain, without_secrets
 from shared.plan import Job
 
 MAX_FAULTS = 3

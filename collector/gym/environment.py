@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
 from collector.objects.procedural import categories_of, generate
-from collector.recorder import interact
-from collector.rollout import Start
+from collector.rollout import Start, interact
 from collector.sim.camera import EmbreeCamera
 from collector.simulated_objects import SimulatedObjects
 from shared.config import CameraConfig, CollectionConfig, StrictModel, parse
@@ -81,7 +80,7 @@ class ObjectEnv(gymnasium.Env[Values, Values]):
 
     Episode k after `reset(seed=s)` is rollout k of `adaafford collect --seed s` on the same objects: the same object,
     hidden dynamics, camera and start state, and the same outcomes of the same actions, to the last bit. It runs the
-    loop of `collector.recorder.interact` on the environment of `collector.rollout.begin`.
+    loop of `collector.rollout.interact` on the environment of `collector.rollout.begin`.
 
     The reward is 1 for a success, else 0. An episode terminates if the simulation diverges, if no point is left in view
     that may be acted on, or, with `end_at_success`, at a success. `gymnasium.make` truncates it after
@@ -170,7 +169,7 @@ class ObjectEnv(gymnasium.Env[Values, Values]):
             return None
         if self.start is None:
             raise UsageError("nothing to draw before the first reset")
-        from collector.viz.preview import part_colours, shaded
+        from collector.viz.rendering import part_colours, shaded
 
         config, target = self._settings.collection.camera, self.start.environment.object
         camera = EmbreeCamera(target, self._observation.world_from_camera, config)

@@ -1,9 +1,11 @@
-"""An articulated object as the scene and the camera need it: rigid bodies joined by moving joints.
+"""An articulated object as the scene and the camera need it: rigid bodies joined by moving joints; and its bounds.
 
 Links that a fixed joint ties together are one body. Body 0 is the static root; body k >= 1 is the k-th movable part
-and is connected to its parent by exactly one moving joint; parents come before children.
+and is connected to its parent by exactly one moving joint; parents come before children. Beyond the bounds the engine
+and the scene are slow, wrong, or crash.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -11,7 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.errors import ObjectError
 from shared.geometry import cross
+from shared.io.text import short
 from shared.plan import ObjectRef
 from shared.types import Float
 
@@ -187,3 +191,66 @@ def _samples(target: ArticulatedObject) -> tuple[Float, ...]:
 def _triangles(meshes: tuple[Mesh, ...]) -> Float:
     """The corners of the triangles of some meshes, [F, 3, 3]."""
     return np.concatenate([np.empty((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)])
+
+
+MAX_PARTS = 150
+"""Published objects have fewer. The engine loses joints beyond 254, and time grows with the square of their number."""
+MAX_DEPTH = 12
+"""Moving joints between a part and the root. Chains of about 30 overlapping links end the process in the engine."""
+MAX_SHAPE_PAIRS = 50_000
+"""Collision shapes of different bodies, which the engine may have to test against each other at every step."""
+MAX_REACH = 20.0
+"""Distance from the root's origin that a vertex may come to. Published objects fit into a sphere of radius 1; the
+hand waits at a height of 50, and must not be met there."""
+MAX_ANGLE = 2 * np.pi
+"""The engine wraps the positions of joints that turn further."""
+
+
+def check_bounds(bodies: Sequence[Body]) -> None:
+    """Refuse an object that is out of bounds.
+
+    Args:
+        bodies: the root, then the parts, parents before children.
+
+    Raises:
+        ObjectError: with one line that has the bound and the value.
+    """
+    parts = len(bodies) - 1
+    if parts > MAX_PARTS:
+        raise ObjectError(f"{parts} movable parts; at most {MAX_PARTS} are allowed")
+    shapes = [len(body.collisions) for body in bodies]
+    pairs = (sum(shapes) ** 2 - sum(count * count for count in shapes)) // 2
+    if pairs > MAX_SHAPE_PAIRS:
+        raise ObjectError(f"{pairs} pairs of collision shapes of different bodies; at most {MAX_SHAPE_PAIRS}")
+    depths, origins = [0], [0.0]
+    for body in bodies[1:]:
+        assert body.joint is not None
+        depths.append(depths[body.joint.parent] + 1)
+        origins.append(origins[body.joint.parent] + _offset(body.joint))
+        if depths[-1] > MAX_DEPTH:
+            raise ObjectError(f"link {short(body.link)} hangs on {depths[-1]} moving joints; at most {MAX_DEPTH}")
+    for body, origin in zip(bodies, origins, strict=True):
+        reach = origin + _radius(body)
+        if not reach <= MAX_REACH:
+            raise ObjectError(
+                f"link {short(body.link)} can be {reach:.3g} from the root's origin; at most {MAX_REACH:g} is allowed "
+                "(published objects fit into a sphere of radius 1; scale meshes in millimetres by 0.001)"
+            )
+
+
+def _offset(joint: Joint) -> float:
+    """How far the body's origin can be from its parent's, after checking the joint's limits."""
+    farthest = max(abs(joint.lower), abs(joint.upper))
+    if joint.kind == "prismatic":
+        return float(np.linalg.norm(joint.parent_from_body[:3, 3])) + farthest
+    if farthest > MAX_ANGLE:
+        raise ObjectError(
+            f"joint {short(joint.name)}: limits {joint.lower:.4g} to {joint.upper:.4g} are beyond one turn either way"
+        )
+    return float(np.linalg.norm(joint.parent_from_body[:3, 3]))
+
+
+def _radius(body: Body) -> float:
+    """The greatest distance of a vertex from the body's origin."""
+    meshes = {id(mesh): mesh for mesh in (*body.visuals, *body.collisions)}.values()
+    return max((float(np.linalg.norm(mesh.vertices, axis=1).max(initial=0.0)) for mesh in meshes), default=0.0)

@@ -15,12 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from collector.objects.articulation import ArticulatedObject, Body, Mesh
-from collector.objects.bounds import check_bounds
+from collector.objects.articulation import ArticulatedObject, Body, Mesh, check_bounds
 from collector.objects.child_process import MAX_ENCODED_BYTES, ChildProcess, decode, encode
 from collector.objects.coacd_process import MAX_PIECES, SETTINGS
-from shared.errors import ObjectError, StoreError, UsageError
-from shared.io.files import read_bounded, remove_tree, write_atomically
+from shared.errors import ObjectError, StoreError
+from shared.io.files import read_bounded, remove_tree, write_atomically, writing
 
 LIMIT_S = 120.0
 """CPU time for one mesh; the largest of published objects take some 20 s."""
@@ -148,12 +147,8 @@ def _cached(path: Path, mesh: Mesh) -> tuple[Mesh, ...] | None:
 
 def _keep(path: Path, pieces: tuple[Mesh, ...]) -> None:
     """Put pieces into the cache."""
-    try:
+    with writing(path.parent, "set XDG_CACHE_HOME to a folder that can"):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
             remove_tree(path)
         write_atomically(path, encode(pieces))
-    except OSError as error:
-        raise UsageError(
-            f"{path.parent}: the cache cannot be written ({error.strerror}); set XDG_CACHE_HOME to a folder that can"
-        ) from None

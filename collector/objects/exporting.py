@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element, SubElement, fromstring, indent, tostr
 import numpy as np
 
 from collector.objects.articulation import ArticulatedObject
-from collector.objects.model import MovablePart, ObjectModel, model_of
+from collector.objects.model import MovablePart, ObjectModel, model_of, point
 from collector.objects.partnet import URDF_FILE
 from collector.objects.writing import (
     MESH_FOLDER,
@@ -106,7 +106,7 @@ def _complete(robot: Element, model: ObjectModel, inertials: list[Inertial]) -> 
     links = {link.get("name"): link for link in robot.iter("link")}
     for name, each in zip(link_names(model)[1:], inertials, strict=True):
         element = Element("inertial")
-        SubElement(element, "origin", xyz=_text_of(each.centre))
+        SubElement(element, "origin", xyz=numbers_text(point(each.centre)))
         SubElement(element, "mass", value=repr(each.mass))
         moments = {f"i{'xyz'[i]}{'xyz'[j]}": repr(float(each.moments[i, j])) for i in range(3) for j in range(i, 3)}
         SubElement(element, "inertia", moments)
@@ -136,7 +136,7 @@ def _mjcf(name: str, model: ObjectModel, inertials: list[Inertial], files: dict[
         bodies.append(body)
         m = each.moments
         full = numbers_text(tuple(float(m[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))))
-        SubElement(body, "inertial", pos=_text_of(each.centre), mass=repr(each.mass), fullinertia=full)
+        SubElement(body, "inertial", pos=numbers_text(point(each.centre)), mass=repr(each.mass), fullinertia=full)
         kind = "slide" if part.kind == "prismatic" else "hinge"
         limits = numbers_text((part.lower, part.upper))
         SubElement(
@@ -164,11 +164,6 @@ def _add_geoms(body: Element, link: str, seen: int, hit: int, shift: str) -> Non
         )
     for number in range(hit):
         SubElement(body, "geom", {"type": "mesh", "mesh": f"{link}-collision-{number}", "pos": shift, "group": "3"})
-
-
-def _text_of(vector: Float) -> str:
-    x, y, z = vector.tolist()
-    return numbers_text((x, y, z))
 
 
 def _text(top: Element) -> str:

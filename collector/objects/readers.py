@@ -13,8 +13,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from pydantic import ValidationError
 
-from collector.objects.articulation import MIN_RANGE, ArticulatedObject, Body, Joint
-from collector.objects.bounds import check_bounds
+from collector.objects.articulation import MIN_RANGE, ArticulatedObject, Body, Joint, check_bounds
 from collector.objects.files import ObjectFiles
 from shared.errors import ObjectError
 from shared.extensions import Registry

@@ -196,7 +196,18 @@ class TwoFingers:
         return link
 
 
-class FreeGripper(Gripper):
+class FingeredGripper(Gripper):
+    """A hand that holds with fingers alone, in whichever way it flies."""
+
+    def holds(self) -> bool:
+        return self.opening() > GRASP_OPENING
+
+    def attached(self) -> bool:
+        """See `Gripper.attached`: fingers only touch."""
+        return False
+
+
+class FreeGripper(FingeredGripper):
     """A hand whose palm is a free body, moved to its target by one drive with six degrees of freedom.
 
     Args:
@@ -271,13 +282,6 @@ class FreeGripper(Gripper):
 
     def opening(self) -> float:
         return float(self._articulation.get_qpos().sum())
-
-    def holds(self) -> bool:
-        return self.opening() > GRASP_OPENING
-
-    def attached(self) -> bool:
-        """See `Gripper.attached`: fingers only touch."""
-        return False
 
     def coordinates(self) -> Float:
         """See `Gripper.coordinates`: palm position, its quaternion, the fingers."""

@@ -10,8 +10,7 @@ from collector.sim.gripper import (
     ALONG,
     ARM_DAMPING,
     ARM_STIFFNESS,
-    GRASP_OPENING,
-    Gripper,
+    FingeredGripper,
     HandShape,
     drive_fingers,
     frame,
@@ -26,7 +25,7 @@ DRIVEN = (0, 1, 2, 5)
 """The joints that move the hand along its axes, and turn it about up."""
 
 
-class JointedGripper(Gripper):
+class JointedGripper(FingeredGripper):
     """A hand whose pose is a joint position.
 
     Args:
@@ -88,13 +87,6 @@ class JointedGripper(Gripper):
 
     def opening(self) -> float:
         return float(self.articulation.get_qpos()[6:].sum())
-
-    def holds(self) -> bool:
-        return self.opening() > GRASP_OPENING
-
-    def attached(self) -> bool:
-        """See `Gripper.attached`: fingers only touch."""
-        return False
 
     def coordinates(self) -> Float:
         """See `Gripper.coordinates`: the positions of the joints."""

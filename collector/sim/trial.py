@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from collector.sim.gripper import GRASP_OPENING, frame, still
-from collector.sim.scene import Scene
-from collector.sim.shortcuts import REST_MOTION, REST_STEPS, SHORTCUTS
+from collector.sim.scene import REST_MOTION, REST_STEPS, SHORTCUTS, Scene
 from shared.config import Fidelity
 from shared.geometry import rotation_about_z
 from shared.primitives import START_DISTANCE, Leg, PrimitiveSpec, hand_start

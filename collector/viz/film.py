@@ -9,13 +9,12 @@ from matplotlib.figure import Figure
 
 from collector.objects.articulation import ArticulatedObject
 from collector.random_proposer import RandomProposer
-from collector.recorder import interact
+from collector.rollout import interact
 from collector.sim.environment import SapienEnvironment
 from collector.sim.grippers import GRIPPERS
 from collector.sim.simulator import StageClock
 from collector.viz.playback import Playback, RecordedTrial, caption
-from collector.viz.preview import save
-from collector.viz.rendering import Picture, Renderer, View, with_most_of_the_hand
+from collector.viz.rendering import Picture, Renderer, View, save, with_most_of_the_hand
 from shared import seeds
 from shared.config import PANDA, CollectionConfig
 from shared.errors import UsageError

@@ -27,10 +27,10 @@ from shared.networks.actions import middle_of, outcome_details
 from shared.networks.network_config import NetworkConfig
 from shared.networks.pointnet2 import CloudBatch, group_cloud
 from shared.pinch import PROFILE_WIDTH, REACH_M, pinch_profiles
-from shared.store.clouds import observations_at
 from shared.store.codecs.columns import LIST, Column, hidden_names, interaction_columns
 from shared.store.codecs.tables import column_values
 from shared.store.layout import MAX_ROWS
+from shared.store.selection import observations_at
 from shared.store.store import Store
 from shared.types import Float, Float32, Observation, Order, OutcomeKind
 

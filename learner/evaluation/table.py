@@ -10,14 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from learner.data.dataset import Dataset, load_dataset
 from learner.data.features import FrozenFeatures
-from learner.evaluation.published_mix import mix_for, shifted_threshold
-from learner.metrics import THRESHOLD, discrimination, ratio_interval
+from learner.metrics import THRESHOLD, discrimination, mix_for, ratio_interval, shifted_threshold
 from learner.stages.oracle import OracleCritic, Teacher
 from learner.stages.trainers import RowCritic, row_critic
 from shared.errors import StoreError
@@ -34,16 +33,18 @@ NO_TRIES_METHOD = "aap-no-tries"
 ORACLE_METHOD = "oracle"
 """A critic that is told the hidden facts: the bound of what interactions can teach. It never acts."""
 
-SHARES = (
-    "f_score",
-    "sample_success",
-    "start_success",
-    "mix_f_score",
-    "shifted_f_score",
-    "share_success",
-    "repeat_success",
-)
-"""Figures that follow from counts by object, so that they have intervals over objects and can be pooled."""
+SHARES = {
+    "f_score": (2, "hits", ("claimed", "true"), "queries"),
+    "sample_success": (1, "successes", ("trials",), "trials"),
+    "start_success": (1, "start_successes", ("start_trials",), "start_trials"),
+    "mix_f_score": (2, "mix_hits", ("mix_claimed", "mix_true"), "mix_true"),
+    "shifted_f_score": (2, "shifted_hits", ("shifted_claimed", "mix_true"), "mix_true"),
+    "share_success": (1, "share_successes", ("share_trials",), "share_trials"),
+    "repeat_success": (1, "repeat_successes", ("repeat_trials",), "repeat_trials"),
+}
+"""Figures that follow from counts by object, so that they have intervals over objects and can be pooled: how often they
+count which column, the columns whose sum they divide it by, and the column that says which objects have any rows. An
+F-score is 2 hits / (claimed + true)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,7 @@ class ObjectCounts:
         successes: those that succeeded.
         start_trials: EXPLOIT_AT_START rows; where a method tries nothing, these are the EXPLOIT rows.
         start_successes: those that succeeded.
-        mix_true: published rows that successful QUERY rows stand for (see `learner.evaluation.published_mix`). This and
+        mix_true: published rows that successful QUERY rows stand for (see `learner.metrics`). This and
             what follows is empty where it was not counted, as in results of older versions.
         mix_claimed: those that rows stand for which the critic called successes.
         mix_hits: those that both hold of.
@@ -91,39 +92,20 @@ class ObjectCounts:
     repeat_trials: tuple[int, ...] = ()
     repeat_successes: tuple[int, ...] = ()
 
-    def f_score(self) -> tuple[float, float, float]:
-        """F1 = 2 hits / (claimed + true), and its 95% interval over objects; NaN where nothing is claimed or true."""
-        return _ratio(2 * np.array(self.hits), np.add(self.claimed, self.true), self.queries)
-
-    def sample_success(self) -> tuple[float, float, float]:
-        """The share of EXPLOIT rows that succeeded, and its 95% interval over objects; NaN where there are none."""
-        return _ratio(self.successes, self.trials, self.trials)
-
-    def start_success(self) -> tuple[float, float, float]:
-        """The same of EXPLOIT_AT_START rows."""
-        return _ratio(self.start_successes, self.start_trials, self.start_trials)
-
-    def mix_f_score(self) -> tuple[float, float, float]:
-        """F1 on the published mix of rows, and its 95% interval over objects; NaN where it was not counted."""
-        return _ratio(2 * np.array(self.mix_hits), np.add(self.mix_claimed, self.mix_true), self.mix_true)
-
-    def shifted_f_score(self) -> tuple[float, float, float]:
-        """The same after the shift of the base rate."""
-        return _ratio(2 * np.array(self.shifted_hits), np.add(self.shifted_claimed, self.mix_true), self.mix_true)
-
-    def share_success(self) -> tuple[float, float, float]:
-        """The share of EXPLOIT_BY_SHARE rows that succeeded, and its 95% interval over objects; NaN where none are."""
-        return _ratio(self.share_successes, self.share_trials, self.share_trials)
-
-    def repeat_success(self) -> tuple[float, float, float]:
-        """The same of REPEAT_AT_START rows."""
-        return _ratio(self.repeat_successes, self.repeat_trials, self.repeat_trials)
+    def share(self, name: str) -> tuple[float, float, float]:
+        """One of `SHARES`, and its 95% interval over objects; NaN where nothing was counted that it divides by."""
+        times, above, below, rows = SHARES[name]
+        seen = np.flatnonzero(getattr(self, rows))
+        over = times * np.asarray(getattr(self, above))[seen]
+        under = np.sum([np.asarray(getattr(self, column))[seen] for column in below], axis=0)
+        whole = float(over.sum() / under.sum()) if under.sum() else float("nan")
+        return whole, *ratio_interval(over, under, seen)
 
     def shares(self) -> dict[str, float]:
-        """All of these by name, and where their intervals begin and end."""
+        """All of `SHARES` by name, and where their intervals begin and end."""
         found: dict[str, float] = {}
         for name in SHARES:
-            value, low, high = getattr(self, name)()
+            value, low, high = self.share(name)
             found |= {name: value, f"{name}_low": low, f"{name}_high": high}
         return found
 
@@ -148,7 +130,7 @@ class EvaluationRow(BaseModel):
         start_success: share of the EXPLOIT_AT_START rows that succeeded.
         trials: how many EXPLOIT rows.
         mean_tries: interactions made a rollout, which stopping may leave below the budget.
-        mix_f_score: as `f_score`, on the published mix of rows (see `learner.evaluation.published_mix`).
+        mix_f_score: as `f_score`, on the published mix of rows (see `learner.metrics`).
         shifted_f_score: the same after logits are shifted by logit(`mix_base_rate`) - logit(`base_rate`).
         share_success: share of the EXPLOIT_BY_SHARE rows that succeeded.
         repeat_success: share of the REPEAT_AT_START rows that succeeded.
@@ -390,11 +372,3 @@ class _Judge:
         if method != PRIOR_METHOD:
             chosen &= rows.budget == budget
         return np.flatnonzero(chosen)
-
-
-def _ratio(above: ArrayLike, below: ArrayLike, rows: ArrayLike) -> tuple[float, float, float]:
-    """sum(above) / sum(below) over the objects with any rows, and its 95% interval."""
-    seen = np.flatnonzero(rows)
-    over, under = np.asarray(above)[seen], np.asarray(below)[seen]
-    whole = float(over.sum() / under.sum()) if under.sum() else float("nan")
-    return whole, *ratio_interval(over, under, seen)

@@ -172,7 +172,8 @@ def run_stage(
     # Nobody may make the folder of a finished stage before everybody has looked.
     data_parallel.wait_for_all()
     if done:
-        _check_done(job.out / DONE_FILE, fingerprint)
+        if read_done(job.out / DONE_FILE).fingerprint != fingerprint:
+            raise UsageError(f"{job.out}: holds a finished run with other data or settings; choose another --out")
         _say(f"{job.out / DONE_FILE}: '{job.stage}' for '{policy.task}' is done")
         return read_policy_folder(job.out)
     make_folder(job.out)
@@ -371,8 +372,3 @@ def _check_checkpoints(out: Path, fingerprint: str) -> None:
     for path in (out / folder / CHECKPOINT_FILE for folder in CHECKPOINT_FOLDERS):
         if path.exists():
             check_fingerprint(read_cursor(path), fingerprint, out)
-
-
-def _check_done(path: Path, fingerprint: str) -> None:
-    if read_done(path).fingerprint != fingerprint:
-        raise UsageError(f"{path.parent}: holds a finished run with other data or settings; choose another --out")

@@ -18,9 +18,8 @@ from shared import seeds
 from shared.errors import UsageError
 from shared.io.files import make_folder, write_atomically
 from shared.networks.pointnet2 import CloudBatch, group_cloud
-from shared.networks.segmentation import SEGMENTATION_NETWORK, SegmentationNetwork
 from shared.segmentation.scenes import MOVABLE, Kind, Scene, read_scene, read_scenes_document, scene_path
-from shared.segmentation.segmenter import SEGMENTATION_FILE, Segmenter, begun
+from shared.segmentation.segmenter import SEGMENTATION_FILE, SEGMENTATION_NETWORK, SegmentationNetwork, Segmenter, begun
 
 VALIDATION_SHARE = 8
 """One object in so many is used for validation."""

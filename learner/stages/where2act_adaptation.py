@@ -126,8 +126,10 @@ def _row_critic(policy: Policy, known: FrozenFeatures) -> RowCritic:
     return scores
 
 
-def _load(config: AdaptationConfig) -> Load:
-    return Load(0, config.batch_rollouts * config.rows_per_rollout * config.context, 0)
-
-
-TRAINING = BaselineTraining(AdaptationConfig, _train, _row_critic, _load, table="adaptation")
+TRAINING = BaselineTraining(
+    AdaptationConfig,
+    _train,
+    _row_critic,
+    lambda config: Load(0, config.batch_rollouts * config.rows_per_rollout * config.context, 0),
+    table="adaptation",
+)

@@ -21,8 +21,8 @@ from learner.stages.trainers import BaselineTraining, Load, RowCritic, StageTrai
 from learner.training.data_parallel import share
 from learner.training.loop import ParameterGroup, StepResult, TrainingResult
 from learner.training.losses import action_scoring_loss
-from shared.policies.fps import actionable_points, distances_to
 from shared.policies.policy import Policy
+from shared.policies.proposers import actionable_points, distances_to
 from shared.policies.where2act_interaction import NAME, TRIES, Where2ActInteraction
 from shared.types import Float, Float32
 

@@ -2,17 +2,23 @@
 
 Every step draws its randomness from the seed, the stage's name and its own number, so that a run that was killed and
 resumed gives the same bits as one that was not (on one kind of CPU, with one number of threads).
+
+Adam is used without PyTorch's compiler: its methods import that, for two seconds, and here nothing is compiled.
 """
 
+import functools
 import json
 import math
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from types import ModuleType
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -23,7 +29,6 @@ from learner.settings import METRICS_FILE, TrainingConfig
 from learner.training import data_parallel
 from learner.training.checkpoint import Cursor, check_fingerprint, read_checkpoint, read_cursor, write_checkpoint
 from learner.training.hardware import Hardware
-from learner.training.optimiser import Adam
 from learner.training.trackers import Trackers
 from shared.errors import UsageError
 from shared.formatting import finite
@@ -175,7 +180,8 @@ class _Loop:
             done=self.cursor.step,
             details=self._details,
             live=not silent and sys.stdout.isatty() and sys.stderr.isatty(),
-            say=_print_nothing if silent else _print_line,
+            # Where another process speaks for this one, nothing is said.
+            say=(lambda line: None) if silent else partial(print, flush=True),
         )
         with progress:
             while not self._finished():
@@ -306,9 +312,42 @@ def rate_factor(config: TrainingConfig, step: int) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * (done - WARMING) / (1.0 - WARMING)))
 
 
-def _print_line(line: str) -> None:
-    print(line, flush=True)
+P = ParamSpec("P")
+T = TypeVar("T")
+
+COMPILER = "torch._dynamo"
 
 
-def _print_nothing(_: str) -> None:
-    """Another process speaks for this one."""
+def without_compiler(method: Callable[P, T]) -> Callable[P, T]:
+    """The same method; while it runs, something that does nothing stands for the compiler, unless that is imported."""
+
+    @functools.wraps(method)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        with _stand_in():
+            return method(*args, **kwargs)
+
+    return call
+
+
+@contextmanager
+def _stand_in() -> Iterator[None]:
+    if COMPILER in sys.modules:
+        yield
+        return
+    module = ModuleType(COMPILER)
+    module.__dict__.update(disable=lambda function, *_, **__: function, graph_break=lambda: None)
+    sys.modules[COMPILER] = module
+    try:
+        yield
+    finally:
+        del sys.modules[COMPILER]
+
+
+class Adam(torch.optim.Adam):
+    """`torch.optim.Adam`, with the same steps."""
+
+    __init__ = without_compiler(torch.optim.Adam.__init__)
+    step = without_compiler(torch.optim.Adam.step)
+    zero_grad = without_compiler(torch.optim.Adam.zero_grad)
+    state_dict = without_compiler(torch.optim.Adam.state_dict)
+    load_state_dict = without_compiler(torch.optim.Adam.load_state_dict)

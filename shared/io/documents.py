@@ -47,7 +47,7 @@ def parse_object(data: bytes, source: str, values: int = MAX_VALUES, *, unique: 
         # stack.
         content = from_json(data, allow_inf_nan=False)
         if unique:
-            json.loads(data, object_pairs_hook=_refuse_twins)
+            json.loads(data, object_pairs_hook=refuse_twins)
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{source}: not valid JSON ({str(error)[:100]}); the file is damaged or foreign") from None
     if not isinstance(content, dict):
@@ -103,19 +103,13 @@ def problem_of(error: ValidationError) -> str:
     return f"{plain(place, MAX_WORD)}: {plain(reason_of(problem), 100)}"
 
 
-def named_twice(pairs: list[tuple[str, Any]]) -> str | None:
-    """The first name of an object's pairs that stands there again; None if there is none."""
+def refuse_twins(pairs: list[tuple[str, Any]]) -> None:
+    """Refuse an object of JSON in which a name stands twice: an `object_pairs_hook` that raises ValueError."""
     seen: set[str] = set()
     for name, _ in pairs:
         if name in seen:
-            return name
+            raise ValueError(f"the name '{plain(name, MAX_WORD)}' occurs twice")
         seen.add(name)
-    return None
-
-
-def _refuse_twins(pairs: list[tuple[str, Any]]) -> None:
-    if (name := named_twice(pairs)) is not None:
-        raise ValueError(f"'{plain(name, MAX_WORD)}' occurs twice")
 
 
 _MAX_VALUE = 60

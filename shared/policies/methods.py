@@ -83,10 +83,10 @@ PROPOSERS = Registry(
         "aip": "shared.policies.proposers:AIP",
         "information-gain": "shared.policies.imagined_outcomes:INFORMATION_GAIN",
         "information-value": "shared.policies.imagined_outcomes:INFORMATION_VALUE",
-        "fps": "shared.policies.fps:FPS",
-        "purefps": "shared.policies.fps:PURE_FPS",
-        "argfps": "shared.policies.fps:WEIGHTED_FPS",
-        "where2act-fps": "shared.policies.fps:WHERE2ACT_FPS",
+        "fps": "shared.policies.proposers:FPS",
+        "purefps": "shared.policies.proposers:PURE_FPS",
+        "argfps": "shared.policies.proposers:WEIGHTED_FPS",
+        "where2act-fps": "shared.policies.proposers:WHERE2ACT_FPS",
     },
 )
 BASELINES = Registry(

@@ -307,7 +307,8 @@ def read_tensors(data: bytes, expected: Mapping[str, Tensor], source: str) -> di
             given = plain(f"{entry.get('dtype')} {entry.get('shape')}", MAX_WORD)
             raise StoreError(f"{source}: tensor '{name}' is {given}, needs {want.dtype} {tuple(want.shape)}")
     try:
-        tensors = _widened(load(data))
+        # Those that were kept in half precision, as the networks want them.
+        tensors = {name: each.float() if each.dtype == torch.float16 else each for name, each in load(data).items()}
     except (SafetensorError, ValueError, RuntimeError) as error:
         line = plain(" ".join(str(error).split()), 100)
         raise StoreError(f"{source}: not readable as safetensors ({line}); the file is damaged or foreign") from None
@@ -332,11 +333,6 @@ def _halved(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if not bool(torch.isfinite(tensor).all()):
             raise UsageError(f"weights '{name}' do not fit into half precision; export them in full precision")
     return halved
-
-
-def _widened(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors that were kept in half precision as the networks want them."""
-    return {name: tensor.float() if tensor.dtype == torch.float16 else tensor for name, tensor in tensors.items()}
 
 
 def _parse_document(data: bytes | None) -> PolicyDocument:

@@ -22,7 +22,6 @@ from shared.plan import Job, Plan, RolloutRecord, Setting
 from shared.store import policies, reader
 from shared.store.backends.base import Folder, StorageBackend, backend_of, is_url
 from shared.store.backends.conformance import check_place
-from shared.store.clouds import observations_of, stacked
 from shared.store.codecs.columns import interaction_columns, rollout_columns
 from shared.store.codecs.observations import ObservationArrays
 from shared.store.coverage import Part, Snapshot, parts_of
@@ -45,7 +44,7 @@ from shared.store.layout import (
 )
 from shared.store.presence import DRIVER
 from shared.store.provenance import store_software
-from shared.store.selection import Condition, Selection
+from shared.store.selection import Condition, Selection, observations_of, stacked
 from shared.store.writer import combined_digest, commit_shard
 from shared.types import Observation
 

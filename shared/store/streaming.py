@@ -21,13 +21,12 @@ from torch.utils.data import IterableDataset, get_worker_info
 from shared.errors import UsageError
 from shared.seeds import generator
 from shared.store import reader
-from shared.store.clouds import check_fields
 from shared.store.codecs.columns import LIST, interaction_columns
 from shared.store.codecs.observations import ObservationArrays
 from shared.store.codecs.tables import column_values
 from shared.store.coverage import Part, Snapshot
 from shared.store.layout import INTERACTIONS_FILE
-from shared.store.selection import Condition
+from shared.store.selection import Condition, check_fields
 from shared.store.store import Store
 
 COLUMNS = ("object_id", "point_index", "point", "rotation", "motion", "success")

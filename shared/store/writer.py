@@ -14,7 +14,7 @@ import numpy as np
 
 from shared.errors import StoreError
 from shared.io.documents import with_checksum
-from shared.io.redaction import without_places
+from shared.io.text import without_places
 from shared.plan import Job, RolloutRecord, RolloutStatus
 from shared.store.backends.base import Folder, StorageBackend, Transaction
 from shared.store.codecs import observations
@@ -204,13 +204,9 @@ def copy_shard(source: Folder, manifest: ShardManifest, backend: StorageBackend)
     """
     if is_committed(shard_folder(backend, manifest.shard_id)):
         return
-    _check_digests(source, manifest)
+    if tuple(map(rollout_digest, read_rollouts(source, manifest))) != manifest.digests:
+        raise StoreError(f"{source}: its rollouts are not those of its manifest; run `adaafford store verify`")
     _publish(backend, manifest, read_files(source, manifest), vetted=True)
-
-
-def _check_digests(shard: Folder, manifest: ShardManifest) -> None:
-    if tuple(rollout_digest(rollout) for rollout in read_rollouts(shard, manifest)) != manifest.digests:
-        raise StoreError(f"{shard}: its rollouts are not those of its manifest; run `adaafford store verify`")
 
 
 def _publish(backend: StorageBackend, manifest: ShardManifest, files: Mapping[str, bytes], *, vetted: bool) -> None:

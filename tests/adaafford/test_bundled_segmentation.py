@@ -9,7 +9,7 @@ from adaafford.parts import SEGMENTATION, bundled_segmenter, read_segmenter
 from adaafford.pretrained import PRETRAINED_FOLDER
 from collector.objects.catalogue import load, scan
 from collector.objects.procedural.catalogue import generate
-from collector.sim.raw_scan import random_scan
+from collector.scenes import random_scan
 from shared.seeds import generator
 from shared.segmentation.scenes import Kind
 from shared.segmentation.segmenter import Segmenter

@@ -18,11 +18,17 @@ from shared.errors import StoreError, UsageError
 from shared.plan import EvaluationConfig
 from shared.policies.adaptation import Adapter, action_from_frame, frames_in_view, movable_points, point_indices
 from shared.policies.critics import Critic, critic_named
-from shared.policies.fps import LEAST_POINTS, THRESHOLD, FpsProposer, actionable_points, distances_to
 from shared.policies.imagined_outcomes import ASKED, BEST, CANDIDATES, SURE, USUAL_MOTION
 from shared.policies.methods import METHODS, BaselineName, CriticName, Method, baselines_of, versions_of
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE, Policy
-from shared.policies.proposers import proposer_named
+from shared.policies.proposers import (
+    LEAST_POINTS,
+    THRESHOLD,
+    FpsProposer,
+    actionable_points,
+    distances_to,
+    proposer_named,
+)
 from shared.policies.where2act_interaction import TRIES, Where2ActInteraction
 from shared.types import Action, Interaction, Observation, Outcome, OutcomeKind
 from tests.support.small_networks import TINY

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from shared.arms.arm import ARMS, Arm, ArmJoint, Capsule, arm_of
-from shared.arms.kinematics import MAX_JOINT_STEP, Chain, chain_of
-from shared.arms.reach import ArmReach, waypoints
+from shared.arms.kinematics import MAX_JOINT_STEP, ArmReach, Chain, chain_of, waypoints
 from shared.errors import UsageError
 from shared.geometry import gripper_rotation
 from shared.primitives import PRIMITIVES, Leg, PrimitiveSpec

@@ -20,13 +20,12 @@ from collector.objects.catalogue import load_ref, scan
 from collector.objects.procedural.catalogue import generate
 from collector.rollout import draw_arm_base
 from collector.setting import make_setting
-from collector.sim.armed import ArmedEnvironment
+from collector.sim.environment import ArmedEnvironment
 from collector.sim.restoration import restored
 from collector.sim.simulator import StageClock
 from collector.worker import Worker
 from shared.arms.arm import ARMS, URDF
-from shared.arms.kinematics import chain_of
-from shared.arms.reach import ArmReach, reachable_points
+from shared.arms.kinematics import ArmReach, chain_of, reachable_points
 from shared.config import CameraConfig, CollectionConfig, Fidelity, RolloutConfig
 from shared.errors import StoreError, UsageError
 from shared.geometry import camera_pose, gripper_rotation

@@ -13,8 +13,8 @@ from hypothesis.extra.numpy import arrays
 
 from benchmarks.hinting import HintSettings, distance_from_axis, hints_of, measure
 from benchmarks.script import run_script
-from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import random_storage_furniture
+from collector.objects.procedural.shapes import normalised
 from collector.objects.writing import write_object
 from shared.plan import InteractionRecord, Job, Plan, RolloutRecord
 from shared.seeds import generator

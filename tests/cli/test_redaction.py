@@ -11,10 +11,10 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from cluster.cli import main
-from cluster.config.command_settings import RayAddress
+from cluster.config.campaign_config import RayAddress
 from cluster.runs.streams import JsonLines, Lines
 from shared.errors import UsageError
-from shared.io.redaction import without_places, without_secrets
+from shared.io.text import without_places, without_secrets
 
 SECRET = "correct-horse-battery"  # noqa: S105 - it opens nothing.
 

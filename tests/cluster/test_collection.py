@@ -10,7 +10,7 @@ import pytest
 
 from cluster.campaign.campaign import steps_of
 from cluster.collection.driver import collect
-from cluster.collection.tally import CollectionProgress
+from cluster.collection.status_writer import CollectionProgress
 from cluster.config.campaign_config import CampaignConfig
 from cluster.workers.session import CurrentWorkerGroup
 from cluster.workers.worker_group import SerialWorkerGroup, WorkerGroup

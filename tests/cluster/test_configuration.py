@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.cli.main import run
-from cluster.config.campaign_config import EXECUTION_SETTINGS, CampaignConfig, RolloutCounts
-from cluster.config.command_settings import EvaluateSettings
+from cluster.config.campaign_config import EXECUTION_SETTINGS, CampaignConfig, EvaluateSettings, RolloutCounts
 from cluster.config.flags import early_flags, layered, parse_flags, preset_names
 from cluster.runs.run_folder import begin, find
 from shared.errors import UsageError

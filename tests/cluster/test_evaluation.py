@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.cli.main import run as adaafford
-from cluster.config.command_settings import EvaluateSettings
+from cluster.config.campaign_config import EvaluateSettings
 from cluster.evaluation.evaluate import PROPOSER, Evaluation
 from cluster.evaluation.run_evaluation import evaluate_run, evaluate_without_run
 from cluster.evaluation.tables import (

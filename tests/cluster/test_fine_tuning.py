@@ -9,8 +9,7 @@ from adaafford.pretrained import load_policy
 from cluster.campaign.campaign import steps_of
 from cluster.campaign.estimate import estimate
 from cluster.cli.main import run as adaafford
-from cluster.config.campaign_config import CampaignConfig
-from cluster.config.command_settings import EvaluateSettings
+from cluster.config.campaign_config import CampaignConfig, EvaluateSettings
 from cluster.evaluation.run_evaluation import evaluate_run
 from cluster.runs.run_folder import RunFolder
 from cluster.runs.warm_start import seen_by, warm_start

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from ray.util.metrics import Gauge, Metric
 
-from cluster.workers import metrics
-from cluster.workers.metrics import WorkerMetrics
+from cluster.workers import ray_group
+from cluster.workers.ray_group import WorkerMetrics
 from collector.job_result import JobResult
 from shared.plan import Plan
 from shared.types import OutcomeKind
@@ -26,7 +26,7 @@ def values(monkeypatch: pytest.MonkeyPatch) -> Tally[tuple[str, ...]]:
     def note(metric: Metric, value: float, tags: dict[str, str] | None = None) -> None:
         record(metric, value, tags)
         name, labels = metric.info["name"], tuple((tags or {}).values())
-        assert f"ray_{name}" in str(metrics.__doc__)
+        assert f"ray_{name}" in str(ray_group.__doc__)
         assert tuple(tags or {}) == metric.info["tag_keys"] and set(tags or {}) <= LABELS
         found[name, *labels] = value + (0 if isinstance(metric, Gauge) else found[name, *labels])
 

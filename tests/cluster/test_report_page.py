@@ -19,14 +19,13 @@ import pytest
 from cluster.cli.main import run as run_command
 from cluster.config.campaign_config import CampaignConfig
 from cluster.evaluation.published import published
-from cluster.evaluation.trials import EvaluationTrial, first_trials, most_telling
 from cluster.reporting.clouds import TANGENT, CloudView, draw_panels, tried
 from cluster.reporting.collecting import wilson
 from cluster.reporting.counterfactuals import Counterfactuals, hinge_twins, variations
 from cluster.reporting.page import MAX_TEXT, Drawing, Page, Section, plain, render, shortened
 from cluster.reporting.results import Results, like_for_like, table_of
 from cluster.reporting.training import after_tries, curves_of, read_entries
-from cluster.reporting.trial_sections import FailedExploit, varied
+from cluster.reporting.trial_sections import EvaluationTrial, FailedExploit, first_trials, most_telling, varied
 from cluster.runs.run_folder import ObjectsUsed, RunFolder, begin
 from cluster.runs.run_log import RunLog
 from learner.evaluation.table import EvaluationRow

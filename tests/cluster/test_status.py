@@ -12,8 +12,15 @@ from hypothesis import strategies as st
 
 from cluster.cli.commands.status import as_json, table
 from cluster.cli.main import run
-from cluster.collection.status_writer import SILENT_S, DriverStatus, State, read_status, status_kept
-from cluster.collection.tally import RECENT_S, CollectionProgress
+from cluster.collection.status_writer import (
+    RECENT_S,
+    SILENT_S,
+    CollectionProgress,
+    DriverStatus,
+    State,
+    read_status,
+    status_kept,
+)
 from cluster.runs.run_log import RunLog
 from cluster.runs.status_snapshot import snapshot_of
 from cluster.runs.streams import JsonLines, Lines, configure

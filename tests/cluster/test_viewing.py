@@ -10,7 +10,7 @@ from adaafford import Store, read_scan
 from adaafford.scans import checked_scan
 from cluster.viewing.beliefs import Beliefs, Quantity, part_colours, told_before, value_colours
 from cluster.viewing.browsing import Browser, Filters, choices
-from cluster.viewing.marking import Eye, Marking
+from cluster.viewing.scan_page import Eye, Marking
 from shared.errors import UsageError
 from shared.io import files
 from shared.plan import Job, Plan, RolloutRecord
@@ -242,7 +242,7 @@ def test_saved_marks_are_read_back_in_the_rows_of_the_scan(tmp_path: Path) -> No
 
 
 def test_a_large_scan_is_marked_by_a_sample_and_saved_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cluster.viewing.marking.WORKING_POINTS", 800)
+    monkeypatch.setattr("cluster.viewing.scan_page.WORKING_POINTS", 800)
     marking = box_scan()
     assert len(marking.points) == 800
     marking.mark(marking.points[:, 0] == 0, movable=True)

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.cli.main import run as adaafford
-from cluster.config.command_settings import ObjectSelection
+from cluster.config.campaign_config import ObjectSelection
 from cluster.config.objects import objects_for
 from collector.objects import procedural
 from collector.objects.catalogue import Catalogue, for_task, load, load_ref, qualifying_parts, read_list, scan, split
-from collector.viz.preview import contact_sheet, part_colours, picture
+from collector.viz.rendering import contact_sheet, part_colours, picture
 from shared.errors import ObjectError, UsageError
 from shared.plan import ObjectRef
 from shared.store import Store, verify

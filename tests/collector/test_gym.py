@@ -21,8 +21,7 @@ from collector.gym.environment import NOT_EXECUTED, action_of, action_values, ob
 from collector.objects.catalogue import load_ref
 from collector.objects.procedural import generate
 from collector.random_proposer import RandomProposer
-from collector.recorder import interact
-from collector.rollout import object_of, run_rollout
+from collector.rollout import interact, object_of, run_rollout
 from collector.sim.simulator import Simulator, StageClock
 from collector.simulated_objects import SimulatedObjects
 from shared.config import CameraConfig, CollectionConfig, RolloutConfig

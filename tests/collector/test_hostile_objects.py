@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collector.objects import bounds, procedural
+from collector.objects import articulation, procedural
 from collector.objects.articulation import Body, Joint
 from collector.objects.catalogue import scan
 from shared.errors import ObjectError
@@ -59,11 +59,11 @@ def test_what_the_engine_cannot_take_is_refused() -> None:
         joint = Joint("j", "prismatic", 0, np.eye(4), np.array([0.0, 0.0, 1.0]), -0.1, upper)
         return dataclasses.replace(body(), joint=joint)
 
-    bounds.check_bounds([body(), *(turning(k) for k in range(bounds.MAX_DEPTH))])
-    bounds.check_bounds([body(19.0), turning(0, 4.0, offset=15.0), turning(1, 0.5), sliding(19.0)])
+    articulation.check_bounds([body(), *(turning(k) for k in range(articulation.MAX_DEPTH))])
+    articulation.check_bounds([body(19.0), turning(0, 4.0, offset=15.0), turning(1, 0.5), sliding(19.0)])
     for bodies, message in (
-        ([body(), *(turning(0) for _ in range(bounds.MAX_PARTS + 1))], "movable parts"),
-        ([body(), *(turning(k) for k in range(bounds.MAX_DEPTH + 1))], "moving joints"),
+        ([body(), *(turning(0) for _ in range(articulation.MAX_PARTS + 1))], "movable parts"),
+        ([body(), *(turning(k) for k in range(articulation.MAX_DEPTH + 1))], "moving joints"),
         ([body(), turning(0, shapes=300), turning(0, shapes=300)], "pairs of collision shapes"),
         ([body(20.1)], "from the root's origin"),
         ([body(), turning(0, 10.0, offset=5.0), turning(1, 9.0, offset=10.0)], "from the root's origin"),
@@ -71,7 +71,7 @@ def test_what_the_engine_cannot_take_is_refused() -> None:
         ([body(), turning(0, upper=6.3)], "beyond one turn"),
     ):
         with pytest.raises(ObjectError, match=message):
-            bounds.check_bounds(bodies)
+            articulation.check_bounds(bodies)
 
 
 def generated(folder: Path, counts: dict[str, int]) -> list[Path]:

@@ -17,9 +17,14 @@ from cluster.cli.main import run
 from collector.objects import meshes
 from collector.objects.articulation import ArticulatedObject, Mesh
 from collector.objects.importing.importer import Imported, ImportSettings, import_object
-from collector.objects.importing.layouts import ARTICULATE_PROGRAMS, GAPARTNET_PARTS, GAPARTNET_URDF, source_of
+from collector.objects.importing.layouts import (
+    ARTICULATE_PROGRAMS,
+    GAPARTNET_PARTS,
+    GAPARTNET_URDF,
+    Placement,
+    source_of,
+)
 from collector.objects.importing.mesh_files import MeshParser, capsule
-from collector.objects.importing.placement import Placement
 from collector.objects.readers import read_object
 from collector.objects.writing import obj_text
 from shared.errors import ObjectError, UsageError
@@ -360,7 +365,7 @@ def test_an_import_that_was_stopped_before_its_picture_goes_on(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("collector.viz.preview.contact_sheet", stop)
+        patched.setattr("collector.viz.rendering.contact_sheet", stop)
         assert run(line) == 130
     made = {path: path.stat().st_mtime_ns for path in (out / "cabinet").rglob("*")}
     assert made and not (out / "cabinet.png").exists()

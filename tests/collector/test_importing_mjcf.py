@@ -8,8 +8,7 @@ import pytest
 from collector.objects import meshes
 from collector.objects.articulation import Body
 from collector.objects.importing.importer import ImportSettings, import_object
-from collector.objects.importing.layouts import SourceFiles, source_of
-from collector.objects.importing.placement import Placement
+from collector.objects.importing.layouts import Placement, SourceFiles, source_of
 from collector.objects.readers import Description
 from collector.objects.writing import obj_text
 from shared.errors import ObjectError

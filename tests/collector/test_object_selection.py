@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from cluster.cli.main import run
-from cluster.config.campaign_config import CampaignConfig, SplitConfig
-from cluster.config.command_settings import ObjectSelection
+from cluster.config.campaign_config import CampaignConfig, ObjectSelection, SplitConfig
 from cluster.config.objects import lists_of, objects_for, split_as_told
 from collector.objects import procedural
 from shared.errors import UsageError

@@ -10,8 +10,8 @@ from collector.objects import procedural
 from collector.objects.articulation import ArticulatedObject, Mesh
 from collector.objects.catalogue import qualifying_parts, scan
 from collector.objects.model import ObjectModel
-from collector.objects.procedural.assembly import GRID, normalised
 from collector.objects.procedural.cabinets import storage_furniture
+from collector.objects.procedural.shapes import GRID, normalised
 from collector.objects.readers import read_object
 from collector.objects.writing import object_files, write_object
 from shared.errors import UsageError

@@ -9,9 +9,8 @@ from cluster.cli.main import run as adaafford
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import load, scan
 from collector.objects.procedural.catalogue import generate
-from collector.scenes import make_scenes
+from collector.scenes import draw_surroundings, extent, make_scenes, random_scan, raw_scan
 from collector.sim.camera import SURROUNDINGS, EmbreeCamera
-from collector.sim.raw_scan import draw_surroundings, extent, random_scan, raw_scan
 from shared.config import CameraConfig
 from shared.errors import UsageError
 from shared.geometry import camera_pose

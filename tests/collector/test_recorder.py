@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from collector.recorder import interact
+from collector.rollout import interact
 from shared.types import Action, Interaction, Observation, Outcome, OutcomeKind
 
 

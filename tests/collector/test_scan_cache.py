@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from collector.objects import scan_cache
+from collector.objects import catalogue
 from collector.objects.catalogue import scan
 from collector.objects.files import ObjectFiles
 from collector.objects.procedural import generate
@@ -25,7 +25,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def objects(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Two faucets, with a cache of their own that takes files as settled however new they are."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(scan_cache, "SETTLED_NS", -(10**18))
+    monkeypatch.setattr(catalogue, "SETTLED_NS", -(10**18))
     return Path(shutil.copytree(made, tmp_path / "objects"))
 
 
@@ -56,7 +56,7 @@ def test_objects_that_did_not_change_are_read_once(objects: Path, read: list[str
 def test_files_that_have_just_changed_are_not_remembered(
     objects: Path, read: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scan_cache, "SETTLED_NS", 3_600_000_000_000)
+    monkeypatch.setattr(catalogue, "SETTLED_NS", 3_600_000_000_000)
     scan(objects)
     read.clear()
     scan(objects)
@@ -110,7 +110,7 @@ def test_what_other_software_found_does_not_count(
 ) -> None:
     scan(objects)
     read.clear()
-    monkeypatch.setattr(scan_cache, "software_versions", lambda: software)
+    monkeypatch.setattr(catalogue, "software_versions", lambda: software)
     scan(objects)
     assert set(read) == {"faucet-0000", "faucet-0001"}
 
@@ -139,7 +139,7 @@ def test_without_a_place_for_a_cache_objects_are_read_anew(
     def refuse(name: str) -> Path:
         raise UsageError(f"there is no place for {name}")
 
-    monkeypatch.setattr(scan_cache, "cache_folder", refuse)
+    monkeypatch.setattr(catalogue, "cache_folder", refuse)
     read.clear()
     assert scan(objects) == first
     assert set(read) == {"faucet-0000", "faucet-0001"}

@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import copy, sys
 import torch
-from learner.training.optimiser import COMPILER, Adam
+from learner.training.loop import COMPILER, Adam
 
 def trained(make):
     torch.manual_seed(0)

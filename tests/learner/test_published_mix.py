@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from learner.data.dataset import load_dataset
 from learner.data.features import FrozenFeatures
-from learner.evaluation.published_mix import PULL_MIX, PUSH_MIX, RowMix, mix_for, shifted_threshold
 from learner.evaluation.table import PRIOR_METHOD, evaluate_store
-from learner.metrics import f_score
+from learner.metrics import PULL_MIX, PUSH_MIX, RowMix, f_score, mix_for, shifted_threshold
 from learner.stages.trainers import row_critic
 from shared.errors import UsageError
 from shared.plan import InteractionRecord, Job, Plan, RolloutRecord

@@ -31,7 +31,7 @@ from learner.training.hardware import Hardware
 from learner.training.loop import CHECKPOINT_FILE
 from shared.errors import UsageError, WorkerError
 from shared.io.files import exclusive_lock
-from shared.io.redaction import without_places
+from shared.io.text import without_places
 from shared.plan import Job, Plan
 from shared.policies.policy import POLICY_FILE, WEIGHTS_FILE
 from shared.progress import Progress

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from collector.objects.articulation import ArticulatedObject
-from collector.sim.scene import Scene
-from collector.sim.shortcuts import CONTACT_RANGE, SHORTCUTS
+from collector.sim.scene import CONTACT_RANGE, SHORTCUTS, Scene
 from collector.sim.trial import Trial
 from shared.config import FIDELITIES, CollectionConfig, Fidelity
 from shared.geometry import gripper_rotation

@@ -10,8 +10,8 @@ import pytest
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.model import ObjectModel
 from collector.objects.procedural import build
-from collector.objects.procedural.assembly import normalised
 from collector.objects.procedural.cabinets import storage_furniture
+from collector.objects.procedural.shapes import normalised
 from collector.objects.readers import read_object
 from collector.objects.writing import write_object
 from collector.random_proposer import RandomProposer

@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from cluster.collection.tally import Tally
+from cluster.collection.status_writer import Tally
 from collector.worker import Worker
 from shared.errors import UsageError
 from shared.io.files import scratch_folder

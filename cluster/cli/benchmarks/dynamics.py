@@ -11,8 +11,7 @@ import numpy as np
 from collector.objects.articulation import ArticulatedObject
 from collector.objects.catalogue import load_ref
 from collector.random_proposer import RandomProposer, RepeatingProposer
-from collector.recorder import interact
-from collector.rollout import draw_dynamics, draw_rollout, make_environment, object_of
+from collector.rollout import draw_dynamics, draw_rollout, interact, make_environment, object_of
 from collector.sim.environment import SAME_STATE, SapienEnvironment, only_sapien
 from collector.sim.simulator import StageClock
 from shared import seeds

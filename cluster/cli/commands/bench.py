@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from pydantic import Field
 
-from cluster.config.command_settings import ObjectSelection
+from cluster.config.campaign_config import ObjectSelection
 from cluster.config.flags import OutFolder, dispatch
 from shared.config import FIDELITIES, CollectionConfig, Fidelity, FidelityVersion
 from shared.formatting import finite

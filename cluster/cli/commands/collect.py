@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from pydantic import Field
 
-from cluster.config.command_settings import ObjectSelection, WorkerSettings
+from cluster.config.campaign_config import ObjectSelection, WorkerSettings
 from cluster.config.flags import early_flags, layered, parse_flags
 from shared.config import CollectionConfig
 from shared.errors import UsageError

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from cluster.config.command_settings import EvaluateSettings
+from cluster.config.campaign_config import EvaluateSettings
 from cluster.config.flags import OutFolder, parse_flags
 from shared.errors import UsageError
 from shared.policies.methods import METHODS

@@ -167,9 +167,8 @@ def _generate(command: GenerateCommand) -> int:
 def _import(command: ImportCommand) -> int:
     from collector.objects.catalogue import OBJECT_ID
     from collector.objects.importing.importer import ImportSettings, import_object
-    from collector.objects.importing.layouts import source_of
-    from collector.objects.importing.placement import USUAL_SIZE, Placement
-    from collector.viz.preview import contact_sheet
+    from collector.objects.importing.layouts import USUAL_SIZE, Placement, source_of
+    from collector.viz.rendering import contact_sheet
     from shared.errors import ObjectError
     from shared.extras import require
 
@@ -286,7 +285,7 @@ def _check_png(out: Path) -> None:
 
 def _preview(command: PreviewCommand) -> int:
     from collector.objects.catalogue import load, scan
-    from collector.viz.preview import contact_sheet
+    from collector.viz.rendering import contact_sheet
 
     _check_png(command.out)
     usable = scan(command.path).usable

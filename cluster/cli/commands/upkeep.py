@@ -1,15 +1,14 @@
 """`adaafford store repair|compact|merge|export`: what makes stores out of stores."""
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from cluster.config.flags import Action
-from shared.errors import StoreError, UsageError
+from shared.errors import UsageError
 from shared.formatting import counted
 from shared.io.text import plain
 from shared.progress import Progress
@@ -73,21 +72,6 @@ class ExportCommand(StoreCommand):
     push: str = ""
     """USER/NAME of a data set on the Hugging Face Hub to put the files into; needs huggingface_hub, and HF_TOKEN in the
     environment."""
-
-
-def _writing(execute: Callable[[Any], int]) -> Callable[[Any], int]:
-    """An action that says in one line what the disk refused; nothing is lost by that, and the same command goes on."""
-
-    def run(command: Any) -> int:
-        try:
-            return execute(command)
-        except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
-            raise StoreError(
-                f"{where}cannot be written ({error.strerror or error}); check space and permissions, then repeat it"
-            ) from None
-
-    return run
 
 
 def _refuse_while_collecting(where: str) -> None:
@@ -197,8 +181,8 @@ def _export(command: ExportCommand) -> int:
 
 
 ACTIONS: dict[str, Action] = {
-    "repair": (RepairCommand, _writing(_repair)),
-    "compact": (CompactCommand, _writing(_compact)),
-    "merge": (MergeCommand, _writing(_merge)),
-    "export": (ExportCommand, _writing(_export)),
+    "repair": (RepairCommand, _repair),
+    "compact": (CompactCommand, _compact),
+    "merge": (MergeCommand, _merge),
+    "export": (ExportCommand, _export),
 }

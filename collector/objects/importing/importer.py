@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 from pydantic_core import from_json
 
-from collector.objects.articulation import ArticulatedObject
-from collector.objects.bounds import check_bounds
-from collector.objects.importing.layouts import Source, SourceFiles, read_urdf
-from collector.objects.importing.placement import Placement, opening_upwards, settled
+from collector.objects.articulation import ArticulatedObject, check_bounds
+from collector.objects.importing.layouts import Placement, Source, SourceFiles, opening_upwards, read_urdf, settled
 from collector.objects.model import ObjectModel, bodies_of, bounding_box, model_of
 from collector.objects.partnet import META_FILE
 from collector.objects.readers import Description, read_object

@@ -7,9 +7,22 @@ the door is free, and the controls move.
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces
-from collector.objects.procedural.assembly import either, hinged, sliding
 from collector.objects.procedural.cabinets import GAP, knob
-from collector.objects.procedural.shapes import BACK, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, moved, rod
+from collector.objects.procedural.shapes import (
+    BACK,
+    FRONT,
+    LEFT,
+    RIGHT,
+    TOP,
+    block,
+    either,
+    grip,
+    hinged,
+    hollow_box,
+    moved,
+    rod,
+    sliding,
+)
 
 BUTTON_TRAVEL = 0.03
 

@@ -12,8 +12,7 @@ from collector.objects.procedural.appliances import (
     random_microwave,
     random_washing_machine,
 )
-from collector.objects.procedural.assembly import normalised
-from collector.objects.procedural.cabinets import random_refrigerator, random_safe
+from collector.objects.procedural.cabinets import random_refrigerator, random_safe, random_table_or_desk
 from collector.objects.procedural.containers import (
     random_box,
     random_bucket,
@@ -21,10 +20,10 @@ from collector.objects.procedural.containers import (
     random_kitchen_pot,
     random_trash_can,
 )
-from collector.objects.procedural.desks import random_table_or_desk
 from collector.objects.procedural.faucets import random_faucet
 from collector.objects.procedural.fitted import random_cabinet
 from collector.objects.procedural.openings import random_door, random_switch, random_window
+from collector.objects.procedural.shapes import normalised
 from collector.objects.writing import write_object
 from shared.errors import UsageError
 from shared.io.files import remove_remnants, writing

@@ -3,7 +3,6 @@
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
-from collector.objects.procedural.assembly import either, hinged, sliding
 from collector.objects.procedural.cabinets import GAP
 from collector.objects.procedural.shapes import (
     BACK,
@@ -14,9 +13,12 @@ from collector.objects.procedural.shapes import (
     TOP,
     arch,
     block,
+    either,
+    hinged,
     hollow_box,
     moved,
     rod,
+    sliding,
     tub,
 )
 

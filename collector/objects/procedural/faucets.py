@@ -5,8 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
-from collector.objects.procedural.assembly import either
-from collector.objects.procedural.shapes import BOTTOM, LEFT, RIGHT, TOP, block, moved, rod
+from collector.objects.procedural.shapes import BOTTOM, LEFT, RIGHT, TOP, block, either, moved, rod
 
 
 def random_faucet(rng: np.random.Generator) -> ObjectModel:

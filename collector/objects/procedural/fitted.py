@@ -13,9 +13,21 @@ from typing import Literal
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
-from collector.objects.procedural.assembly import either, hinged
 from collector.objects.procedural.cabinets import Carcass, FrontPanel, random_storage_furniture
-from collector.objects.procedural.shapes import BACK, BOTTOM, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, rod
+from collector.objects.procedural.shapes import (
+    BACK,
+    BOTTOM,
+    FRONT,
+    LEFT,
+    RIGHT,
+    TOP,
+    block,
+    either,
+    grip,
+    hinged,
+    hollow_box,
+    rod,
+)
 
 WALL = 0.018
 CLEAR = 0.003

@@ -5,9 +5,21 @@ from typing import Literal
 import numpy as np
 
 from collector.objects.model import MovablePart, ObjectModel, Pieces, Point
-from collector.objects.procedural.assembly import hinged, sliding
 from collector.objects.procedural.cabinets import GAP
-from collector.objects.procedural.shapes import BACK, BOTTOM, FRONT, LEFT, RIGHT, TOP, block, grip, hollow_box, ring
+from collector.objects.procedural.shapes import (
+    BACK,
+    BOTTOM,
+    FRONT,
+    LEFT,
+    RIGHT,
+    TOP,
+    block,
+    grip,
+    hinged,
+    hollow_box,
+    ring,
+    sliding,
+)
 
 
 def random_door(rng: np.random.Generator) -> ObjectModel:

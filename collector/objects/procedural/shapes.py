@@ -1,17 +1,19 @@
-"""The convex pieces that objects are made of.
+"""The convex pieces that objects are made of, and an object under construction: a body and the parts that hang on it.
 
-Directions are unit vectors as triples. Objects face -x, left is +y, up is +z. Each piece is one convex mesh, so that
-its hull in physics is itself; hollow things are made of several.
+Directions are unit vectors as triples. Objects face -x, left is +y, up is +z; all is in one frame, all closed. Each
+piece is one convex mesh, so that its hull in physics is itself; hollow things are made of several.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from collector.objects import meshes
 from collector.objects.articulation import Mesh
-from collector.objects.model import Pieces, Point, point
+from collector.objects.model import MovablePart, ObjectModel, Pieces, Point, bounding_box, mapped, point
+from shared.types import Float
 
 FRONT: Point = (-1.0, 0.0, 0.0)
 BACK: Point = (1.0, 0.0, 0.0)
@@ -115,3 +117,55 @@ def moved(pieces: Pieces, by: Point) -> Pieces:
 
 _STAVE_FACES = meshes.box(np.ones(3)).faces
 """A stave has a box's topology: its corners are listed along one side, then up, then outward, as a box's are."""
+
+
+GRID = 2.0**-14
+"""Coordinates are multiples of this, so that moving them between frames rounds nothing: twins stay identical."""
+
+
+def hinged(name: str, pieces: Pieces, corner: Point, edge: Point, outward: Point, upper: float) -> MovablePart:
+    """A panel that turns outward about one of its edges.
+
+    Its axis runs along the outer face: a panel turned there leaves its frame and its neighbours without touching them.
+
+    Args:
+        name: semantic name.
+        pieces: the panel and what is on it.
+        corner: a point of the edge, on the outer face.
+        edge: direction from the panel's middle to the edge that it turns about.
+        outward: direction in which the far edge moves first.
+        upper: how far it opens, rad.
+    """
+    return MovablePart(name, "revolute", pieces, corner, point(np.cross(np.negative(edge), outward)), upper)
+
+
+def sliding(name: str, pieces: Pieces, direction: Point, upper: float) -> MovablePart:
+    """A part that slides along `direction`."""
+    return MovablePart(name, "prismatic", pieces, (0.0, 0.0, 0.0), direction, upper)
+
+
+def shifted(part: MovablePart, by: Point) -> MovablePart:
+    """The part somewhere else."""
+    return replace(part, pieces=moved(part.pieces, by), origin=point(np.add(part.origin, by)))
+
+
+def either(
+    rng: np.random.Generator,
+    first: Callable[[np.random.Generator], ObjectModel],
+    second: Callable[[np.random.Generator], ObjectModel],
+) -> ObjectModel:
+    """An object of one of two kinds, equally often; what is drawn for the first does not depend on the second."""
+    (aside,) = rng.spawn(1)
+    return second(aside) if aside.random() < 0.5 else first(rng)
+
+
+def normalised(assembly: ObjectModel) -> ObjectModel:
+    """The object about the origin, its bounding box's diagonal 2, as PartNet-Mobility has it, on the grid."""
+    low, high = bounding_box(assembly)
+    scale, centre = 2.0 / float(np.linalg.norm(high - low)), (low + high) / 2
+
+    def place(vectors: Float) -> Float:
+        steps: Float = np.round((vectors - centre) * scale / GRID)
+        return steps * GRID
+
+    return mapped(assembly, place, lambda axis: axis, scale)

@@ -19,7 +19,7 @@ from obstore.exceptions import AlreadyExistsError, BaseError, GenericError, Prec
 from obstore.store import S3Store
 
 from shared.errors import MissingError, StoreError, UnreadableError, UsageError
-from shared.io.redaction import without_secrets
+from shared.io.text import without_secrets
 from shared.store.backends.base import URL_SCHEME, StorageBackend, Transaction
 from shared.store.presence import present
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from shared.errors import StoreError, UsageError
-from shared.plan import Job, RolloutStatus
+from shared.plan import Job, RolloutStatus, missing_ranges
 from shared.store import reader
 from shared.store.codecs.tables import joined
 from shared.store.coverage import Part, Window, order, overlapping, parts_of
@@ -154,7 +154,8 @@ def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
             continue
         shard, rollouts = reader.shard_folder(store.backend, manifest.shard_id), store.read_rollouts(manifest.shard_id)
         wanted = {rollout.index for rollout in rollouts if rollout.status is RolloutStatus.QUARANTINED}
-        kept = [Job(manifest.plan_key, *ends) for ends in _ranges(manifest.start, manifest.stop, wanted)]
+        left = missing_ranges(manifest.stop, [(0, manifest.start), *((number, number + 1) for number in wanted)])
+        kept = [Job(manifest.plan_key, *ends) for ends in left]
         # What a compaction has not set aside yet holds these rollouts as well.
         old = [job for job in store.jobs(manifest.plan_key) if job.start < manifest.stop and manifest.start < job.stop]
         for job in kept:
@@ -163,11 +164,3 @@ def reopen_quarantined(store: Store, plan_keys: Sequence[str]) -> int:
             set_aside(store.backend, f"{SHARDS_FOLDER}/{job.shard_id}")
         count += len(wanted)
     return count
-
-
-def _ranges(start: int, stop: int, without: set[int]) -> Iterator[tuple[int, int]]:
-    """The half-open ranges from `start` to `stop` that are left without some numbers."""
-    for number in [*sorted(without), stop]:
-        if start < number:
-            yield start, number
-        start = number + 1
