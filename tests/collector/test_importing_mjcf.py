@@ -162,6 +162,15 @@ def test_included_files_are_bounded_together(room: Path, monkeypatch: pytest.Mon
         read(room)
 
 
+def test_each_geom_of_a_mesh_counts(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("collector.objects.urdf_bodies.MAX_OBJECT_VERTICES", 8 * 40)
+    room.write_text(mjcf('<geom type="mesh" mesh="panel"/>' * 39))
+    read(room)
+    room.write_text(mjcf('<geom type="mesh" mesh="panel"/>' * 41))
+    with pytest.raises(ObjectError, match="more than 320 vertices"):
+        read(room)
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [

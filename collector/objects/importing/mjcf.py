@@ -22,7 +22,7 @@ from collector.objects.articulation import Body, Joint, Mesh
 from collector.objects.importing.layouts import UNKNOWN_CATEGORY, SourceFiles
 from collector.objects.importing.mesh_files import MeshParser, capsule
 from collector.objects.readers import Description
-from collector.objects.urdf_bodies import MAX_OBJECT_TRIANGLES, MAX_OBJECT_VERTICES, listed
+from collector.objects.urdf_bodies import ShapeCount, listed
 from shared.errors import ObjectError
 from shared.io.text import plain, short
 from shared.types import Float
@@ -196,8 +196,7 @@ class _Meshes:
     files: SourceFiles
     parser: MeshParser
     folders: Sequence[str]
-    vertices: int = 0
-    triangles: int = 0
+    count: ShapeCount = field(default_factory=ShapeCount)
 
     def replaced(self, spec: Any) -> dict[str, Mesh]:
         """The meshes of a tree by name, as its geoms show them; each that has a file gets a stand-in for MuJoCo."""
@@ -224,9 +223,7 @@ class _Meshes:
         if found is None:
             raise ObjectError(f"the mesh {short(path)} is absent; name its folder by --search-path")
         mesh = self.parser.parse(found[1], found[0])
-        self.vertices, self.triangles = self.vertices + len(mesh.vertices), self.triangles + len(mesh.faces)
-        if self.vertices > MAX_OBJECT_VERTICES or self.triangles > MAX_OBJECT_TRIANGLES:
-            raise ObjectError(f"more than {MAX_OBJECT_VERTICES} vertices or {MAX_OBJECT_TRIANGLES} triangles in all")
+        self.count.add(mesh)
         return mesh
 
 
@@ -239,6 +236,7 @@ class _Bodies:
                 raise ObjectError(f"a size, a position or a limit is not finite, or beyond {meshes.MAX_COORDINATE:g}")
         self._model = model
         self._found = found
+        self._count = ShapeCount()
         self._free: list[str] = []
         self._hides = self._groups_that_hide()
 
@@ -319,6 +317,7 @@ class _Bodies:
             shape = self._shape(g)
             if shape is None:
                 continue
+            self._count.add(shape[0])
             mesh = meshes.placed(shape[0], pose @ shape[1])
             collides = self._collides(g)
             if collides:
