@@ -22,6 +22,24 @@ from shared.types import Float
 MIN_RANGE = 1e-6
 """A joint whose limits are closer than this cannot move."""
 
+MAX_PARTS = 150
+"""Published objects have fewer. The engine loses joints beyond 254, and time grows with the square of their number."""
+MAX_DEPTH = 12
+"""Moving joints between a part and the root. Chains of about 30 overlapping links end the process in the engine."""
+MAX_SHAPE_PAIRS = 50_000
+"""Collision shapes of different bodies, which the engine may have to test against each other at every step."""
+MAX_REACH = 20.0
+"""Distance from the root's origin that a vertex may come to. Published objects fit into a sphere of radius 1; the
+hand waits at a height of 50, and must not be met there."""
+MAX_LAYERS = 3000
+"""Triangles that a camera's ray may have to be tested against, by the boxes around them as a share of that around a
+published object. An image of 448 x 448 pixels takes a second of processor time for 750 layers; published objects have
+up to 21."""
+USUAL_HALF_SURFACE = 12.0
+"""Of the box around a sphere of radius 1."""
+MAX_ANGLE = 2 * np.pi
+"""The engine wraps the positions of joints that turn further."""
+
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
@@ -193,19 +211,6 @@ def _triangles(meshes: tuple[Mesh, ...]) -> Float:
     return np.concatenate([np.empty((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)])
 
 
-MAX_PARTS = 150
-"""Published objects have fewer. The engine loses joints beyond 254, and time grows with the square of their number."""
-MAX_DEPTH = 12
-"""Moving joints between a part and the root. Chains of about 30 overlapping links end the process in the engine."""
-MAX_SHAPE_PAIRS = 50_000
-"""Collision shapes of different bodies, which the engine may have to test against each other at every step."""
-MAX_REACH = 20.0
-"""Distance from the root's origin that a vertex may come to. Published objects fit into a sphere of radius 1; the
-hand waits at a height of 50, and must not be met there."""
-MAX_ANGLE = 2 * np.pi
-"""The engine wraps the positions of joints that turn further."""
-
-
 def check_bounds(bodies: Sequence[Body]) -> None:
     """Refuse an object that is out of bounds.
 
@@ -236,6 +241,19 @@ def check_bounds(bodies: Sequence[Body]) -> None:
                 f"link {short(body.link)} can be {reach:.3g} from the root's origin; at most {MAX_REACH:g} is allowed "
                 "(published objects fit into a sphere of radius 1; scale meshes in millimetres by 0.001)"
             )
+    layers = sum(_layers(mesh) for body in bodies for mesh in body.visuals)
+    if layers > MAX_LAYERS:
+        raise ObjectError(
+            f"so many of its triangles overlap that a ray of the camera meets up to {layers:.0f}; at most {MAX_LAYERS} "
+            "are allowed; simplify its meshes"
+        )
+
+
+def _layers(mesh: Mesh) -> float:
+    """How many of the mesh's triangles a ray through a published object would meet if they were around its middle."""
+    corners = [mesh.vertices[mesh.faces[:, k]] for k in range(3)]
+    x, y, z = (np.maximum.reduce(corners) - np.minimum.reduce(corners)).T
+    return float(np.minimum((x * y + y * z + z * x) / USUAL_HALF_SURFACE, 1.0).sum())
 
 
 def _offset(joint: Joint) -> float:

@@ -15,10 +15,8 @@ from shared.types import Float
 from shared.urdf import Shape, Urdf, UrdfJoint
 
 MAX_OBJECT_BYTES = 256 << 20
-MAX_OBJECT_VERTICES = 5_000_000
-"""Over all shapes: a URDF may show one mesh many times."""
-MAX_OBJECT_TRIANGLES = 10_000_000
-"""Over all mesh files."""
+MAX_OBJECT_VERTICES, MAX_OBJECT_TRIANGLES = 5_000_000, 10_000_000
+"""Over all mesh files, and over all shapes, which may show one mesh many times."""
 MOST_NAMED = 3
 """Meshes and joints that a note names."""
 
@@ -37,6 +35,24 @@ class MeshFiles(Protocol):
     def notes(self) -> Iterator[str]:
         """What was found in another place than the URDF says."""
         ...
+
+
+@dataclass(slots=True)
+class ShapeCount:
+    """Counts what the shapes of an object hold, each mesh as often as it is shown."""
+
+    vertices: int = 0
+    triangles: int = 0
+
+    def add(self, mesh: Mesh) -> None:
+        """Count a mesh before it is placed.
+
+        Raises:
+            ObjectError: it is too much.
+        """
+        self.vertices, self.triangles = self.vertices + len(mesh.vertices), self.triangles + len(mesh.faces)
+        if self.vertices > MAX_OBJECT_VERTICES or self.triangles > MAX_OBJECT_TRIANGLES:
+            raise ObjectError(f"more than {MAX_OBJECT_VERTICES} vertices or {MAX_OBJECT_TRIANGLES} triangles in all")
 
 
 class UrdfMeshes:
@@ -125,7 +141,7 @@ class UrdfBodies:
         self._names = names
         self._where = where
         self._found = found
-        self._vertices = 0
+        self._count = ShapeCount()
         self._passable: list[str] = []
 
     def notes(self) -> Iterator[str]:
@@ -174,6 +190,7 @@ class UrdfBodies:
         if link.visuals and not link.collisions:
             body.without_collision.append(name)
         for shapes, meshes_of_body in ((link.visuals, body.visuals), (link.collisions, body.collisions)):
+            here = set[tuple[object, ...]]()
             for shape in shapes:
                 if shape.kind == "mesh" and self._found.get(shape.file) is None:
                     body.lost.append(shape.file)
@@ -181,14 +198,21 @@ class UrdfBodies:
                 key = (shape.kind, shape.file, shape.size.tobytes(), shape.link_from_shape.tobytes())
                 if key not in kept:
                     kept[key] = self._mesh(shape, body_from_link)
+                elif key in here:
+                    self._counted(kept[key])
+                here.add(key)
                 meshes_of_body.append(kept[key])
 
     def _mesh(self, shape: Shape, body_from_link: Float) -> Mesh:
         mesh, scale = self._local_mesh(shape)
-        self._vertices += len(mesh.vertices)
-        if self._vertices > MAX_OBJECT_VERTICES:
-            raise ObjectError(f"{self._where}: more than {MAX_OBJECT_VERTICES} vertices in all")
-        return meshes.placed(mesh, body_from_link @ shape.link_from_shape, scale)
+        return meshes.placed(self._counted(mesh), body_from_link @ shape.link_from_shape, scale)
+
+    def _counted(self, mesh: Mesh) -> Mesh:
+        try:
+            self._count.add(mesh)
+        except ObjectError as error:
+            raise ObjectError(f"{self._where}: {error}") from None
+        return mesh
 
     def _local_mesh(self, shape: Shape) -> tuple[Mesh, Float | None]:
         match shape.kind:

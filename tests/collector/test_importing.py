@@ -16,6 +16,7 @@ import shared.extras as extras_module
 from cluster.cli.main import run
 from collector.objects import meshes
 from collector.objects.articulation import ArticulatedObject, Mesh
+from collector.objects.child_process import ChildProcess
 from collector.objects.importing.importer import Imported, ImportSettings, import_object
 from collector.objects.importing.layouts import (
     ARTICULATE_PROGRAMS,
@@ -24,7 +25,7 @@ from collector.objects.importing.layouts import (
     Placement,
     source_of,
 )
-from collector.objects.importing.mesh_files import MeshParser, capsule
+from collector.objects.importing.mesh_files import TOO_LARGE, MeshParser, capsule
 from collector.objects.readers import read_object
 from collector.objects.writing import obj_text
 from shared.errors import ObjectError, UsageError
@@ -221,6 +222,27 @@ def test_a_mesh_that_cannot_be_read_is_refused_with_one_line(
     with pytest.raises(ObjectError, match=reason) as raised:
         parser.parse(data, name)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(("answer", "reason"), [(b"", "within 60 s"), (TOO_LARGE, "too much memory")])
+def test_a_mesh_that_takes_too_long_or_too_much_memory_is_not_left_out(
+    answer: bytes, reason: str, cabinet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An object may name thousands of them."""
+    monkeypatch.setattr(ChildProcess, "ask", lambda *_: answer)
+    monkeypatch.setattr(ChildProcess, "end", lambda _: True)
+    (cabinet.parent / "meshes/door.glb").write_bytes(glb(meshes.box(BOX)))
+    cabinet.write_text(urdf("meshes/door.glb"))
+    with pytest.raises(ObjectError, match=reason):
+        imported(cabinet, tmp_path / "objects")
+
+
+def test_a_mesh_of_more_than_the_memory_of_its_process_is_refused() -> None:
+    pytest.importorskip("trimesh")
+    program = "from collector.objects.importing import mesh_process, mesh_files\n"
+    program += "mesh_process.trimesh.load_scene = lambda *_, **__: bytes(1 << 60)\n"
+    program += "print(mesh_process._answer(b'.ply    ') == mesh_files.TOO_LARGE)"
+    assert subprocess.run([sys.executable, "-c", program], check=True, capture_output=True).stdout == b"True\n"
 
 
 @pytest.mark.parametrize(

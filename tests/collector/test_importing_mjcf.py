@@ -33,7 +33,8 @@ DOOR = """
 def mjcf(body: str = DOOR, more: str = "", compiler: str = 'meshdir="meshes"') -> str:
     return f"""<mujoco model="room">
   <compiler {compiler}/>
-  <asset><mesh name="panel" file="panel.obj" scale="2 1 1"/><texture type="2d" file="/etc/passwd"/></asset>
+  <asset><mesh name="panel" file="panel.obj" scale="2 1 1"/><texture type="2d" file="/etc/passwd"/>
+    <texture type="skybox" builtin="gradient" width="8" height="8"/></asset>
   <default><default class="door"><joint type="hinge" range="-90 0" ref="10"/></default></default>
   <worldbody><light pos="0 0 3"/><geom type="plane" size="5 5 1"/>{body}</worldbody>
   <actuator><motor joint="hinge"/></actuator>{more}
@@ -119,6 +120,13 @@ def test_several_joints_of_a_body_become_a_chain(room: Path) -> None:
     assert described.bodies[door.parent].link == "frame"
 
 
+def test_nothing_but_what_is_said_is_printed(room: Path) -> None:
+    """MuJoCo warns of two joints about one axis, and a warning is an error in tests."""
+    hinge = '<joint axis="0 0 1" range="0 90"/>'
+    room.write_text(mjcf(DOOR.replace("<geom", f"{hinge}{hinge}<geom", 1)))
+    assert len(read(room).bodies) == 4
+
+
 def test_the_body_that_is_named_is_imported_alone(room: Path, tmp_path: Path) -> None:
     room.write_text(mjcf(DOOR + '<body name="robot"><freejoint/><geom size="0.4"/></body>'))
     assert any("'robot'" in note for note in read(room).notes)
@@ -145,6 +153,23 @@ def test_includes_are_read_inside_the_folders_alone(room: Path) -> None:
     assert len(read(room, outside.parent).bodies) == 2
 
 
+def test_included_files_are_bounded_together(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (room.parent / "door.xml").write_text(f"<mujocoinclude>{DOOR}</mujocoinclude>")
+    room.write_text(mjcf('<include file="door.xml"/>'))
+    monkeypatch.setattr("collector.objects.importing.mjcf.MAX_BYTES", room.stat().st_size + 10)
+    with pytest.raises(ObjectError, match="at most 10"):
+        read(room)
+
+
+def test_each_geom_of_a_mesh_counts(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("collector.objects.urdf_bodies.MAX_OBJECT_VERTICES", 8 * 40)
+    room.write_text(mjcf('<geom type="mesh" mesh="panel"/>' * 39))
+    read(room)
+    room.write_text(mjcf('<geom type="mesh" mesh="panel"/>' * 41))
+    with pytest.raises(ObjectError, match="more than 320 vertices"):
+        read(room)
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -153,6 +178,9 @@ def test_includes_are_read_inside_the_folders_alone(room: Path) -> None:
         (mjcf(more='<extension><plugin plugin="mujoco.pid"/></extension>'), "plugins are code"),
         (mjcf('<body><geom size="1"/><plugin instance="x"/></body>'), "plugins are code"),
         (mjcf('<replicate count="1000000"><geom size="1"/></replicate>'), "<replicate> is refused"),
+        (mjcf().replace('file="panel.obj"', 'builtin="cone" params="5 1"'), "<builtin> is refused"),
+        (mjcf('<body pos="0 0 1"/>' * 600), "more than 500 elements <body>"),
+        (mjcf(more="<default>" + '<default class="many"/>' * 600 + "</default>"), "more than 500 elements <default>"),
         (mjcf('<body><joint type="ball"/><geom size="1"/></body>'), "ball joint"),
         (mjcf("<body>" * 200 + "</body>" * 200), "nested"),
         (mjcf('<body><geom type="box" size="nonsense"/></body>'), "MuJoCo refuses it"),

@@ -160,15 +160,17 @@ def _many_shapes(folder: Path) -> None:
     edit(folder, '<link name="lock">', '<link name="lock">' + shape * urdf.MAX_SHAPES)
 
 
-def _many_copies(folder: Path) -> None:
-    # One large mesh that a small URDF shows again and again.
-    rows = "".join(f"v {i} {i % 2} 0\n" for i in range(20_000))
-    (folder / "textured_objs/cube.obj").write_text(rows + "f 1 2 3\n")
-    shapes = "".join(
-        f'<visual><origin xyz="{i} 0 0"/><geometry><mesh filename="textured_objs/cube.obj"/></geometry></visual>'
-        for i in range(300)
-    )
-    edit(folder, '<link name="lock">', '<link name="lock">' + shapes)
+def _many_copies(apart: int) -> Callable[[Path], None]:
+    """One large mesh that a small URDF shows again and again, at the same place or elsewhere."""
+
+    def spoil(folder: Path) -> None:
+        rows = "".join(f"v {i} {i % 2} 0\n" for i in range(20_000))
+        (folder / "textured_objs/cube.obj").write_text(rows + "f 1 2 3\n")
+        mesh = '<geometry><mesh filename="textured_objs/cube.obj"/></geometry>'
+        shapes = "".join(f'<visual><origin xyz="{i * apart} 0 0"/>{mesh}</visual>' for i in range(300))
+        edit(folder, '<link name="lock">', '<link name="lock">' + shapes)
+
+    return spoil
 
 
 def _escape_by_link(folder: Path) -> None:
@@ -304,7 +306,9 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "many links": (_many_links, "at most 500"),
     "many shapes": (_many_shapes, "more than 5000 shapes"),
-    "many copies of a large mesh": (_many_copies, "vertices in all"),
+    "many copies of a large mesh": (_many_copies(1), "more than 5000000 vertices"),
+    "many copies of a large mesh at one place": (_many_copies(0), "more than 5000000 vertices"),
+    "many triangles at one place": (_written(CUBE, b"v 0 0 0\nv 1 0 0\nv 0 1 1\n" + b"f 1 2 3\n" * 40_000), "overlap"),
     "malformed JSON": (_written("meta.json", b"{"), "malformed JSON"),
     "JSON with a giant number": (_written("meta.json", b"9" * 10_000), "malformed JSON"),
     "JSON nested deeply": (_deep_json, "recursion limit exceeded at line 1 column"),

@@ -19,6 +19,8 @@ LIMIT_S = 60.0
 """CPU time for one file."""
 ENDING_BYTES = 8
 """Of the ending, with blanks after it, which a question begins with."""
+TOO_LARGE = b"l"
+"""An answer: the file needs too much memory."""
 _MOST_ANSWER, _MOST_SAID = 4 << 30, 120
 
 
@@ -64,8 +66,11 @@ class MeshParser:
         except (EOFError, ValueError):
             answer = b""
         if not answer:
-            slow = self._child.end()
-            raise ObjectError(f"{name}: cannot be read{f' within {LIMIT_S:g} s' if slow else ''}; convert it to OBJ")
+            if self._child.end():
+                raise meshes.MeshSizeError(f"{name}: cannot be read within {LIMIT_S:g} s; convert it to OBJ")
+            raise ObjectError(f"{name}: cannot be read; convert it to OBJ")
+        if answer == TOO_LARGE:
+            raise meshes.MeshSizeError(f"{name}: needs too much memory; convert it to OBJ")
         said = plain(" ".join(answer[1:].decode("utf-8", "replace").split()), _MOST_SAID)
         raise ObjectError(f"{name}: cannot be read ({said})")
 

@@ -1,7 +1,7 @@
 """A process that reads meshes by trimesh, one after another, until its standard input ends.
 
 A question is the file's ending (8 bytes, blanks at its end) and the file. An answer is "m" and a list of meshes
-(`encode`), or "e" and what is wrong. Files come from anybody, and the readers have no bounds of
+(`encode`), "e" and what is wrong, or `TOO_LARGE`. Files come from anybody, and the readers have no bounds of
 their own, so they run in a process that has: on memory and on time.
 """
 
@@ -17,7 +17,7 @@ import trimesh
 
 from collector.objects.articulation import Mesh
 from collector.objects.child_process import answer_all, encode
-from collector.objects.importing.mesh_files import ENDING_BYTES
+from collector.objects.importing.mesh_files import ENDING_BYTES, TOO_LARGE
 from collector.objects.meshes import MAX_OBJ_BYTES
 
 MAX_MEMORY = 4 << 30
@@ -68,7 +68,7 @@ def _answer(question: bytes) -> bytes:
     try:
         return b"m" + encode([read_mesh(question[ENDING_BYTES:], question[:ENDING_BYTES].decode().rstrip())])
     except MemoryError:
-        return b"e" + b"it needs too much memory"
+        return TOO_LARGE
     except Exception as error:  # noqa: BLE001 - whatever a reader makes of a file from outside.
         return b"e" + f"{type(error).__name__}: {error}".encode("utf-8", "replace")
 

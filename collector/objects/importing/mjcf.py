@@ -6,6 +6,8 @@ shape and the joints of an object are left out before; plugins, and elements tha
 """
 
 import re
+import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -20,22 +22,25 @@ from collector.objects.articulation import Body, Joint, Mesh
 from collector.objects.importing.layouts import UNKNOWN_CATEGORY, SourceFiles
 from collector.objects.importing.mesh_files import MeshParser, capsule
 from collector.objects.readers import Description
-from collector.objects.urdf_bodies import MAX_OBJECT_TRIANGLES, MAX_OBJECT_VERTICES, listed
+from collector.objects.urdf_bodies import ShapeCount, listed
 from shared.errors import ObjectError
 from shared.io.text import plain, short
 from shared.types import Float
 from shared.urdf import MAX_LINKS, MAX_SHAPES, parse_xml
 
 MAX_BYTES = 4 << 20
-"""Of one document."""
-MAX_FILES, MAX_ELEMENTS, MAX_DEPTH = 100, 50_000, 100
+"""Of all documents together: meshes may be written in them, and MuJoCo's time for a mesh has no other bound."""
+MAX_FILES, MAX_DEPTH = 100, 100
+MOST = {"body": MAX_LINKS, "default": MAX_LINKS}
+"""Elements of these names, and `MAX_SHAPES` of each other: MuJoCo's time grows with the square of their number."""
 SECTIONS = ("compiler", "default", "asset", "worldbody")
 KEPT = {"compiler", "default", "asset", "worldbody", "mesh", "body", "joint", "freejoint", "geom", "frame"}
 REFUSED = {
     **dict.fromkeys(("plugin", "extension"), "plugins are code"),
     **dict.fromkeys(("replicate", "composite", "flexcomp", "attach"), "it makes other elements"),
+    "builtin": "it makes a mesh of any size",
 }
-"""Elements that are refused, and why; all that are in neither set are left out."""
+"""Elements, and attributes of meshes, that are refused, and why; elements that are in neither set are left out."""
 SAID = ("equality", "tendon", "hfield", "skin", "flex")
 """What is left out and would make the object move or look otherwise."""
 MAX_SAID = 160
@@ -65,7 +70,10 @@ def read_mjcf(file: Path, files: SourceFiles, root: str | None = None, radians: 
     with MeshParser() as parser:
         found = _Meshes(files, parser, document.folders).replaced(spec)
     try:
-        model = spec.compile()
+        with warnings.catch_warnings():
+            # Of masses and inertias, which are drawn for each rollout.
+            warnings.simplefilter("ignore")
+            model = spec.compile()
     except (ValueError, RuntimeError) as error:
         raise ObjectError(f"MuJoCo refuses it: {_said(error)}") from None
     bodies, notes = _Bodies(model, found).below(root)
@@ -83,7 +91,8 @@ class _Document:
     """Of meshes, as the compiler element says: `assetdir` or `meshdir`, and "strip" where paths are to be stripped."""
     left_out: dict[str, int] = field(default_factory=dict)
     documents: int = 0
-    elements: int = 0
+    bytes: int = 0
+    elements: Counter[str] = field(default_factory=Counter)
 
     def expanded(self, name: str) -> Element:
         """The whole of the document that is called `name`."""
@@ -100,9 +109,10 @@ class _Document:
             raise ObjectError(f"more than {MAX_FILES} files are included")
         if name in stack:
             raise ObjectError(f"{short(name)} includes itself")
-        found = self.files.find(name, MAX_BYTES)
+        found = self.files.find(name, MAX_BYTES - self.bytes)
         if found is None:
             raise ObjectError(f"the included file {short(name)} is absent")
+        self.bytes += len(found[1])
         try:
             return parse_xml(found[1], MAX_BYTES)
         except ObjectError as error:
@@ -113,17 +123,18 @@ class _Document:
         if depth > MAX_DEPTH:
             raise ObjectError(f"elements are nested in more than {MAX_DEPTH} others")
         for child in element:
-            self.elements += 1
-            if self.elements > MAX_ELEMENTS:
-                raise ObjectError(f"more than {MAX_ELEMENTS} elements")
-            if child.tag in REFUSED or "plugin" in child.attrib:
-                tag = child.tag if child.tag in REFUSED else "plugin"
-                raise ObjectError(f"<{tag}> is refused, since {REFUSED[tag]}; save the model as MuJoCo compiles it")
+            made = child.tag == "mesh" and "builtin" in child.attrib
+            word = "plugin" if "plugin" in child.attrib else "builtin" if made else child.tag
+            if word in REFUSED:
+                raise ObjectError(f"<{word}> is refused, since {REFUSED[word]}; save the model as MuJoCo compiles it")
             if child.tag == "include":
                 yield from self._included(child.get("file", ""), stack, depth)
             elif child.tag not in KEPT or (depth == 0 and child.tag not in SECTIONS):
                 self.left_out[child.tag] = self.left_out.get(child.tag, 0) + 1
             else:
+                self.elements[child.tag] += 1
+                if self.elements[child.tag] > (most := MOST.get(child.tag, MAX_SHAPES)):
+                    raise ObjectError(f"more than {most} elements <{child.tag}>")
                 kept = Element(child.tag, {k: v for k, v in child.attrib.items() if k not in ("material", "user")})
                 if child.tag == "compiler":
                     self._note_folders(kept)
@@ -185,8 +196,7 @@ class _Meshes:
     files: SourceFiles
     parser: MeshParser
     folders: Sequence[str]
-    vertices: int = 0
-    triangles: int = 0
+    count: ShapeCount = field(default_factory=ShapeCount)
 
     def replaced(self, spec: Any) -> dict[str, Mesh]:
         """The meshes of a tree by name, as its geoms show them; each that has a file gets a stand-in for MuJoCo."""
@@ -213,9 +223,7 @@ class _Meshes:
         if found is None:
             raise ObjectError(f"the mesh {short(path)} is absent; name its folder by --search-path")
         mesh = self.parser.parse(found[1], found[0])
-        self.vertices, self.triangles = self.vertices + len(mesh.vertices), self.triangles + len(mesh.faces)
-        if self.vertices > MAX_OBJECT_VERTICES or self.triangles > MAX_OBJECT_TRIANGLES:
-            raise ObjectError(f"more than {MAX_OBJECT_VERTICES} vertices or {MAX_OBJECT_TRIANGLES} triangles in all")
+        self.count.add(mesh)
         return mesh
 
 
@@ -223,13 +231,12 @@ class _Bodies:
     """Merges the bodies of a compiled model: those that no joint moves become part of their parents."""
 
     def __init__(self, model: Any, found: dict[str, Mesh]) -> None:
-        if model.nbody > MAX_LINKS or model.ngeom > MAX_SHAPES:
-            raise ObjectError(f"{model.nbody} bodies and {model.ngeom} geoms; at most {MAX_LINKS} and {MAX_SHAPES}")
         for numbers in (model.geom_size, model.geom_pos, model.body_pos, model.jnt_pos, model.jnt_range, model.qpos0):
             if not (np.abs(numbers) <= meshes.MAX_COORDINATE).all():
                 raise ObjectError(f"a size, a position or a limit is not finite, or beyond {meshes.MAX_COORDINATE:g}")
         self._model = model
         self._found = found
+        self._count = ShapeCount()
         self._free: list[str] = []
         self._hides = self._groups_that_hide()
 
@@ -310,6 +317,7 @@ class _Bodies:
             shape = self._shape(g)
             if shape is None:
                 continue
+            self._count.add(shape[0])
             mesh = meshes.placed(shape[0], pose @ shape[1])
             collides = self._collides(g)
             if collides:
