@@ -14,6 +14,7 @@ SUCCESS, FAILURE, PROPOSED = "#148a3d", "#d11f2f", "#111111"
 COLOURS = {
     "ours-final": ACCENT,
     "ours-no-iteration": "#e07b39",
+    "ours-spread": "#e35d7c",
     "ours-gain": "#8c6d1f",
     "ours-value": "#c9a227",
     "ours-fps": SECOND,

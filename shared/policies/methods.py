@@ -81,6 +81,7 @@ PROPOSERS = Registry(
     ProposerKind,
     {
         "aip": "shared.policies.proposers:AIP",
+        "aip-spread": "shared.policies.proposers:SPREAD_AIP",
         "information-gain": "shared.policies.imagined_outcomes:INFORMATION_GAIN",
         "information-value": "shared.policies.imagined_outcomes:INFORMATION_VALUE",
         "fps": "shared.policies.proposers:FPS",
@@ -151,6 +152,7 @@ METHODS: Registry[Method] = Registry(
         "ours-fps": Method("fps", "aap"),
         "ours-no-iteration": Method("aip", "aap", version=FIRST_VERSION),
         "ours-final": Method("aip", "aap"),
+        "ours-spread": Method("aip-spread", "aap", reference=True),
         "ours-gain": Method("information-gain", "aap", reference=True),
         "ours-value": Method("information-value", "aap", reference=True),
     },

@@ -29,6 +29,10 @@ REPEAT_M = 0.12
 """Metres from an interaction that succeeded to its repetition; the part has moved since, and the hand with it."""
 MOST_REACHED = 50
 """The most repetitions that are checked for whether the arm reaches them."""
+THRESHOLD = 0.5
+"""Actionability of points that are worth an interaction (AdaAfford, supplement, Details of Baselines)."""
+LEAST_POINTS = 50
+"""If fewer points reach the threshold, it is lowered until this many do (the same section)."""
 STOP_THRESHOLD = 0.0
 """The paper says "e.g., 0.05", but the AIP score is a drop of a loss whose mean here is about 0.003, so that 0.05 would
 stop at once; 0 stops where no point promises any gain."""
@@ -75,7 +79,7 @@ class AipProposer:
         """The next action, or None to stop."""
         if len(history) >= self.budget:
             return None
-        candidates = movable_points(observation)
+        candidates = self.candidates(observation, history)
         latent = self.adapter.z(history)
         information = self.adapter.information(observation, candidates, latent)
         if len(history) >= self.at_least and float(information.max()) < self.threshold:
@@ -92,12 +96,37 @@ class AipProposer:
 
         return reachable_action(observation, candidates, choose, act)
 
+    def candidates(self, observation: Observation, history: Sequence[Interaction]) -> NDArray[np.int64]:
+        """Indices of the points that it chooses among, [C]."""
+        return movable_points(observation)
 
-AIP = ProposerKind(
-    AipProposer,
-    ("prior", "aap", "aip"),
-    draw=lambda adapter, rng, budget, share: AipProposer(adapter, rng, budget, share=share),
-)
+
+class SpreadAipProposer(AipProposer):
+    """AIP among the half of the movable points that is furthest from the points of the earlier interactions.
+
+    Addition: the paper's AIP chooses among all points. On real objects it goes on near its last interaction, which
+    reveals little (docs/results/experiments.md, "AIP in the furthest half").
+    """
+
+    name = "aip-spread"
+
+    def candidates(self, observation: Observation, history: Sequence[Interaction]) -> NDArray[np.int64]:
+        """Indices of the furthest half of the movable points, [C]."""
+        movable = movable_points(observation)
+        tried = np.array([each.action.point for each in history]).reshape(-1, 3)
+        spread = distances_to(observation.points[movable].astype(np.float64), tried)
+        return movable if spread is None else movable[spread >= np.median(spread)]
+
+
+def _aip(proposer: type[AipProposer]) -> ProposerKind:
+    return ProposerKind(
+        proposer,
+        ("prior", "aap", "aip"),
+        draw=lambda adapter, rng, budget, share: proposer(adapter, rng, budget, share=share),
+    )
+
+
+AIP, SPREAD_AIP = _aip(AipProposer), _aip(SpreadAipProposer)
 
 
 class ExploitProposer:
@@ -172,66 +201,6 @@ class RepeatProposer:
             if reached is not None:
                 return reached
         return self._exploit.propose(observation, history)
-
-
-def points_of(share: float, observation: Observation) -> int:
-    """How many points a share of a cloud is, at least one; of all points, because the published 100 are of 10,000.
-
-    Raises:
-        UsageError: it is no share.
-    """
-    if not 0 < share <= 1:
-        raise UsageError(f"share={share}: give more than 0 and at most 1 of a cloud's points")
-    return max(1, round(share * len(observation.points)))
-
-
-def drawn_point(candidates: NDArray[np.int64], scores: Float32, count: int, rng: np.random.Generator) -> int:
-    """One of the `count` candidates with the highest scores, at random; `candidates` and `scores`: [C]."""
-    return int(rng.choice(best_points(candidates, scores, count)))
-
-
-def best_points(candidates: NDArray[np.int64], scores: Float32, count: int) -> NDArray[np.int64]:
-    """The `count` candidates with the highest scores, best first; `candidates` and `scores`: [C]."""
-    # A stable sort makes the choice among equal scores independent of the machine.
-    return candidates[np.argsort(-scores, kind="stable")][:count]
-
-
-def proposer_named(
-    name: str, adapter: Adapter | None, rng: np.random.Generator, budget: int, share: float | None = None
-) -> Proposer:
-    """The proposer called `name`.
-
-    Args:
-        name: one of `shared.policies.methods.PROPOSERS`; or the name of a critic, for a proposer that exploits it; or
-            `REPEATING` and that name, for one that repeats what succeeded.
-        adapter: the policy; None if the proposer needs none.
-        rng: of its random draws.
-        budget: how many interactions it may propose.
-        share: of a cloud's points, from which its points are drawn, as far as it draws any; None: its own way.
-
-    Raises:
-        UsageError: no proposer has this name, or the networks that it needs are not trained.
-    """
-    if name in PROPOSERS.names():
-        kind = PROPOSERS.get(name)
-        if adapter is not None:
-            adapter.policy.require(*kind.modules)
-        if share is not None and kind.draw is not None:
-            return kind.draw(adapter, rng, budget, share)
-        return kind.make(adapter, rng, budget)
-    if adapter is not None and name in critic_names():
-        return ExploitProposer(adapter, rng, name, share)
-    critic = name.removeprefix(REPEATING)
-    if adapter is not None and critic in critic_names():
-        return RepeatProposer(adapter, rng, critic, share)
-    known = ", ".join((*PROPOSERS.names(), *critic_names()))
-    raise UsageError(f"no proposer is called '{name}'; allowed: {known}")
-
-
-THRESHOLD = 0.5
-"""Actionability of points that are worth an interaction (AdaAfford, supplement, Details of Baselines)."""
-LEAST_POINTS = 50
-"""If fewer points reach the threshold, it is lowered until this many do (the same section)."""
 
 
 class FpsProposer(ABC):
@@ -339,3 +308,57 @@ def actionable_points(actionability: Float32, least: int = LEAST_POINTS) -> NDAr
     if len(above) >= least:
         return above
     return np.sort(np.argsort(-actionability, kind="stable")[:least])
+
+
+def points_of(share: float, observation: Observation) -> int:
+    """How many points a share of a cloud is, at least one; of all points, because the published 100 are of 10,000.
+
+    Raises:
+        UsageError: it is no share.
+    """
+    if not 0 < share <= 1:
+        raise UsageError(f"share={share}: give more than 0 and at most 1 of a cloud's points")
+    return max(1, round(share * len(observation.points)))
+
+
+def drawn_point(candidates: NDArray[np.int64], scores: Float32, count: int, rng: np.random.Generator) -> int:
+    """One of the `count` candidates with the highest scores, at random; `candidates` and `scores`: [C]."""
+    return int(rng.choice(best_points(candidates, scores, count)))
+
+
+def best_points(candidates: NDArray[np.int64], scores: Float32, count: int) -> NDArray[np.int64]:
+    """The `count` candidates with the highest scores, best first; `candidates` and `scores`: [C]."""
+    # A stable sort makes the choice among equal scores independent of the machine.
+    return candidates[np.argsort(-scores, kind="stable")][:count]
+
+
+def proposer_named(
+    name: str, adapter: Adapter | None, rng: np.random.Generator, budget: int, share: float | None = None
+) -> Proposer:
+    """The proposer called `name`.
+
+    Args:
+        name: one of `shared.policies.methods.PROPOSERS`; or the name of a critic, for a proposer that exploits it; or
+            `REPEATING` and that name, for one that repeats what succeeded.
+        adapter: the policy; None if the proposer needs none.
+        rng: of its random draws.
+        budget: how many interactions it may propose.
+        share: of a cloud's points, from which its points are drawn, as far as it draws any; None: its own way.
+
+    Raises:
+        UsageError: no proposer has this name, or the networks that it needs are not trained.
+    """
+    if name in PROPOSERS.names():
+        kind = PROPOSERS.get(name)
+        if adapter is not None:
+            adapter.policy.require(*kind.modules)
+        if share is not None and kind.draw is not None:
+            return kind.draw(adapter, rng, budget, share)
+        return kind.make(adapter, rng, budget)
+    if adapter is not None and name in critic_names():
+        return ExploitProposer(adapter, rng, name, share)
+    critic = name.removeprefix(REPEATING)
+    if adapter is not None and critic in critic_names():
+        return RepeatProposer(adapter, rng, critic, share)
+    known = ", ".join((*PROPOSERS.names(), *critic_names()))
+    raise UsageError(f"no proposer is called '{name}'; allowed: {known}")

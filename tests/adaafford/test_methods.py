@@ -25,6 +25,7 @@ from shared.policies.proposers import (
     LEAST_POINTS,
     THRESHOLD,
     FpsProposer,
+    SpreadAipProposer,
     actionable_points,
     distances_to,
     proposer_named,
@@ -182,6 +183,25 @@ def test_each_try_is_the_farthest_among_the_actionable(adapter: Adapter, name: s
             assert spread is not None
             assert action.point_index == among[spread.argmax()]
         history.append(Interaction(observation, action, Outcome(OutcomeKind.OK, 0.0, False)))
+
+
+def test_spread_aip_chooses_in_the_half_of_the_points_far_from_its_interactions(adapter: Adapter) -> None:
+    observation = observation_of()
+    movable, history = movable_points(observation), list[Interaction]()
+    for count in range(4):
+        among = movable
+        if history:
+            tried = np.array([interaction.action.point for interaction in history])
+            spread = distances_to(observation.points[movable].astype(float), tried)
+            assert spread is not None
+            among = movable[np.argsort(-spread)[: (len(movable) + 1) // 2]]
+        best = among[adapter.information(observation, among, adapter.z(history)).argmax()]
+        proposer = SpreadAipProposer(adapter, np.random.default_rng(count), 4, at_least=4)
+        action = proposer.propose(observation, history)
+        assert action is not None
+        assert action.point_index == best
+        history.append(Interaction(observation, action, Outcome(OutcomeKind.OK, 0.0, False)))
+    assert proposer_named("aip-spread", adapter, np.random.default_rng(0), 4).propose(observation, history) is None
 
 
 def test_the_threshold_falls_until_enough_points_are_above_it() -> None:

@@ -50,7 +50,17 @@ from tests.support.single_door import door
 from tests.support.small_policies import policy_with_all
 
 PANDA = ARMS.get("panda")
-PROPOSERS = ("aip", "fps", "purefps", "argfps", "information-gain", "information-value", "aap", "where2act")
+PROPOSERS = (
+    "aip",
+    "fps",
+    "purefps",
+    "argfps",
+    "aip-spread",
+    "information-gain",
+    "information-value",
+    "aap",
+    "where2act",
+)
 INTO = gripper_rotation(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
 
 
@@ -98,7 +108,7 @@ def test_none_of_a_thousand_proposals_is_out_of_reach(arm: str) -> None:
     reach = ArmReach(ARMS.get(arm), base, PRIMITIVES.get("pull"), seen.points.astype(np.float64))
     armed = dataclasses.replace(seen, reach=reach)
     for k in range(1000):
-        name = PROPOSERS[k % 2 * 5]
+        name = PROPOSERS[k % 2 * 6]
         assert reached(armed, proposer_named(name, adapter, rng, 4, 0.2 if name == "aip" else None).propose(armed, []))
 
 
