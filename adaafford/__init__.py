@@ -3,7 +3,7 @@
 For a robot, implement `Environment` with its camera and arm, and let the policy choose the actions:
 
 >>> adapter = Adapter(load_policy("pull-closed-door"))
->>> proposer, history = AipProposer(adapter, numpy.random.default_rng(1), budget=4), []
+>>> proposer, history = SpreadAipProposer(adapter, numpy.random.default_rng(1), budget=4), []
 >>> while (action := proposer.propose(observation := robot.observe(), history)) is not None:
 ...     history.append(Interaction(observation, action, robot.execute(action)))
 >>> heat = adapter.affordance(robot.observe(), history)      # [N], where the part can be moved
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from shared.errors import AdaAffordError
     from shared.policies.adaptation import Adapter
     from shared.policies.policy import Policy
-    from shared.policies.proposers import AipProposer, ExploitProposer, RepeatProposer
+    from shared.policies.proposers import AipProposer, ExploitProposer, RepeatProposer, SpreadAipProposer
     from shared.store import Store
     from shared.store.streaming import InteractionDataset
     from shared.types import Action, Environment, Interaction, Observation, Outcome, OutcomeKind, Proposer
@@ -49,7 +49,7 @@ else:
         "shared.policies.adaptation": ("Adapter",),
         "shared.errors": ("AdaAffordError",),
         "shared.policies.policy": ("Policy",),
-        "shared.policies.proposers": ("AipProposer", "ExploitProposer", "RepeatProposer"),
+        "shared.policies.proposers": ("AipProposer", "ExploitProposer", "RepeatProposer", "SpreadAipProposer"),
         "shared.store": ("Store",),
         "shared.store.streaming": ("InteractionDataset",),
         "shared.types": (
@@ -89,6 +89,7 @@ __all__ = [
     "Proposer",
     "RepeatProposer",
     "ScanFrame",
+    "SpreadAipProposer",
     "Store",
     "__version__",
     "checked_scan",

@@ -43,7 +43,7 @@ from shared.io.text import plain
 from shared.policies.adaptation import Adapter
 from shared.policies.methods import PROPOSERS
 from shared.policies.policy import Policy
-from shared.policies.proposers import AipProposer, RepeatProposer, proposer_named
+from shared.policies.proposers import RepeatProposer, SpreadAipProposer, proposer_named
 from shared.primitives import PRIMITIVES
 from shared.types import Action, Observation
 
@@ -213,7 +213,7 @@ class Session:
         part: str | None = None,
         lens: Lens | None = None,
         selection: Selection = WHOLE,
-        proposer: Name = AipProposer.name,
+        proposer: Name = SpreadAipProposer.name,
     ) -> None:
         policy.require("prior", "aap", *PROPOSERS.get(proposer).modules)
         self._choice = None if part is None else part_choice(part)

@@ -11,11 +11,11 @@ import numpy as np
 
 from adaafford import (
     Adapter,
-    AipProposer,
     Interaction,
     Outcome,
     OutcomeKind,
     ScanFrame,
+    SpreadAipProposer,
     load_policy,
     observation_of,
     read_scan,
@@ -30,8 +30,8 @@ adapter = Adapter(load_policy("push-faucet"))
 frame = ScanFrame.around(scan)  # Ties the frame of the scans to the frame of the networks.
 observation = observation_of(scan, frame)  # O: 2,048 points of the scan, and their normals.
 
-# AIP proposes the interaction u = (p, R) from which the most is learnt.
-proposer = AipProposer(adapter, np.random.default_rng(1), budget=4)
+# AIP proposes the interaction u = (p, R) from which the most is learnt, far from the earlier ones.
+proposer = SpreadAipProposer(adapter, np.random.default_rng(1), budget=4)
 history: list[Interaction] = []
 action = proposer.propose(observation, history)
 assert action is not None, "the first interaction is always proposed"

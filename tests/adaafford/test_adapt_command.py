@@ -310,7 +310,7 @@ def test_an_export_leaves_other_files_alone(tmp_path: Path, capsys: pytest.Captu
 # The loop.
 
 
-@pytest.mark.parametrize("proposer", ["aip", "information-gain", "purefps"])
+@pytest.mark.parametrize("proposer", ["aip", "aip-spread", "information-gain", "purefps"])
 def test_a_session_fills_its_history_and_then_acts(policy_folder: Path, scan: Path, proposer: str) -> None:
     live = session(policy_folder, scan, budget=1, proposer=proposer)
     first = live.step(scan)
@@ -567,7 +567,7 @@ def test_the_command_proposes_takes_an_outcome_and_writes_a_heatmap(
             "nowhere/heat.ply: there is no folder nowhere; create it",
         ),
         (["--budget", "0"], "at least one interaction"),
-        (["--proposer", "afps"], "allowed: aip, information-gain"),
+        (["--proposer", "afps"], "allowed: aip, aip-spread"),
         (["--points", "9"], "allowed are 64 to 16384"),
     ):
         assert adaafford(["adapt", *where, *wrong]) == 2

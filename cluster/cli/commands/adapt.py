@@ -74,9 +74,9 @@ class AdaptCommand:
     recorded: Annotated[Selection, tyro.conf.arg(name="")] = WHOLE
     budget: int = 4
     """The most interactions that are proposed before the final action."""
-    proposer: str = "aip"
-    """What chooses these interactions: aip, as published; information-gain, which reveals more on pulls and takes
-    half a second a step; or another proposer, such as argfps."""
+    proposer: str = "aip-spread"
+    """What chooses these interactions: aip-spread, AIP in the half of the points furthest from the earlier ones; aip,
+    as published; information-gain, which takes half a second a step; or another proposer, such as fps."""
     points: int = 2048
     """How many points of a scan the policy receives: as many as in its training (see its model card)."""
     seed: Annotated[int, Field(ge=0)] = 0

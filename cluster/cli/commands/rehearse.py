@@ -48,7 +48,7 @@ class RehearseCommand:
     """With --policy: how many objects with freshly drawn hidden dynamics, each in a folder of its own, are tried."""
     budget: int = 4
     """With --policy: the most interactions before the final action."""
-    proposer: str = "aip"
+    proposer: str = "aip-spread"
     """With --policy: what chooses these interactions, as for `adapt`."""
     goal: float | None = None
     """With --policy: go on until the part has moved so far from where it was at first, rad or m."""
