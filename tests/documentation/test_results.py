@@ -34,7 +34,7 @@ def test_the_table_of_a_task_has_the_figures_of_its_evaluation(task: str) -> Non
     heads, *written = rows((RESULTS / f"bundled-{task}.md").read_text(), 14)
     evaluated = {(row[0], row[1]): dict(zip(heads, row, strict=True)) for row in written}
     table = rows(section(task), 10)[1:]
-    assert len(table) == 11
+    assert len(table) == 14
     for row in table:
         name = (re.findall(r"`(.*)`", row[0]) or [METHODS[row[0]]])[0]
         budget = {"where2act": "4", "aap-no-tries": "0"}.get(name, row[1])
@@ -56,5 +56,9 @@ def test_the_summary_has_the_figures_of_the_tables() -> None:
         assert float(policy) == min(float(row[2]) for row in table if row[1] == "4"), "the best way"
         assert numbers(where2act) == numbers(after_four["Where2Act"][BEST_SHARE])[:1]
         assert numbers(drawn) == numbers(after_four[way][BEST_SHARE])[:1]
-        after = "after furthest points" if way == "furthest points" else "after AIP's interactions"
+        after = {
+            "furthest points": "after furthest points",
+            "AIP": "after AIP's interactions",
+            "AIP, furthest half": "after AIP's in the furthest half",
+        }[way]
         assert re.search(rf"/ {repeated} (?:of the actions )?(?:succeed )?(?:from the start )?{after}", text)
