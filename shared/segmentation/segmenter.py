@@ -82,8 +82,8 @@ class Part:
 
     @property
     def confidence(self) -> float:
-        """That it moves in this way."""
-        return self.confidences[self.kind]
+        """That it moves, in whichever way."""
+        return sum(self.confidences.values())
 
 
 @dataclass(frozen=True, slots=True)
