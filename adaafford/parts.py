@@ -114,8 +114,8 @@ class FoundPart(StrictModel):
     """In order of confidence, from 1; `--part` takes it."""
     kind: Literal["turning", "sliding"]
     confidence: float = Field(ge=0, le=1)
-    """The network's mean probability over the part's points that they are of a part of this kind, less for a part of
-    few points. The kind is one that the task acts on."""
+    """The network's mean probability over the part's points that they are of a part that moves as the task wants it,
+    less for a part of few points."""
     centre: Vector
     """The median of the points that are seen of it, frame of the scan."""
     points: int

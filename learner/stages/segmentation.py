@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,12 +19,14 @@ from shared import seeds
 from shared.errors import UsageError
 from shared.io.files import make_folder, write_atomically
 from shared.networks.pointnet2 import CloudBatch, group_cloud
+from shared.policies.policy import WEIGHTS_FILE
 from shared.segmentation.scenes import MOVABLE, Kind, Scene, read_scene, read_scenes_document, scene_path
 from shared.segmentation.segmenter import SEGMENTATION_FILE, SEGMENTATION_NETWORK, SegmentationNetwork, Segmenter, begun
 
 VALIDATION_SHARE = 8
 """One object in so many is used for validation."""
 VALIDATION_SCENES = 48
+"""Of each folder, at most."""
 LEAVES = "|".join(map(re.escape, (METRICS_FILE, CHECKPOINT_FILE, EVENTS_FOLDER, SEGMENTATION_FILE)))
 """Names in the folder of a training; one of them is there as soon as it trains."""
 OFFSET_WEIGHT = 4.0
@@ -119,41 +122,52 @@ class SegmentationStage:
 
 
 def train_segmentation(
-    folder: Path, out: Path, config: SegmentationConfig, seed: int
+    folders: Sequence[Path], out: Path, config: SegmentationConfig, seed: int, init: Segmenter | None = None
 ) -> tuple[Segmenter, TrainingResult]:
     """Train a segmentation network from scenes, or go on with it; its files are written to `out`.
 
     Args:
-        folder: of scenes.
+        folders: of scenes; of each, one object in eight validates.
         out: folder for the network, its metrics and its checkpoint.
         config: how long, how fast.
         seed: of all randomness.
+        init: whose weights are the start; random ones where there is none.
 
     Raises:
         UsageError: there are no scenes, or too few objects to hold one out; or `out` is of another training.
         StoreError: a scene is damaged.
     """
     refuse_foreign(out, LEAVES)
-    document = read_scenes_document(folder)
-    objects = len(document.objects)
-    held_out = seeds.generator(seed, "segmentation/validation").permutation(objects)[: -(-objects // VALIDATION_SHARE)]
-    if len(held_out) == objects:
-        raise UsageError(f"{folder}: has scenes of one object; validation needs another")
-    numbers = np.arange(document.count)
-    validates = np.isin(numbers % objects, held_out)
-    if validates.all() or not validates.any():
-        raise UsageError(f"{folder}: has too few scenes; make more of them")
-
-    def read(chosen: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Scenes:
-        return Scenes.of([read_scene(scene_path(folder, int(number))) for number in chosen])
-
-    stage = SegmentationStage(
-        begun(seed), read(numbers[~validates]), read(numbers[validates][:VALIDATION_SCENES]), config
-    )
+    network = begun(seed)
+    told = ""
+    learnt: list[Path] = []
+    held_out: list[Path] = []
+    for folder in folders:
+        document = read_scenes_document(folder)
+        told += document.model_dump_json()
+        objects = len(document.objects)
+        order = seeds.generator(seed, "segmentation/validation").permutation(objects)
+        if (few := -(-objects // VALIDATION_SHARE)) == objects:
+            raise UsageError(f"{folder}: has scenes of one object; validation needs another")
+        numbers = np.arange(document.count)
+        validates = np.isin(numbers % objects, order[:few])
+        if validates.all() or not validates.any():
+            raise UsageError(f"{folder}: has too few scenes; make more of them")
+        learnt += [scene_path(folder, int(number)) for number in numbers[~validates]]
+        held_out += [scene_path(folder, int(number)) for number in numbers[validates][:VALIDATION_SCENES]]
+    told += f"{config.model_dump_json()}{seed}{SEGMENTATION_NETWORK.model_dump_json()}"
+    if init is not None:
+        network.load_state_dict(init.network.state_dict())
+        told += hashlib.sha256(init.to_files()[WEIGHTS_FILE]).hexdigest()
+    known, others = (Scenes.of([read_scene(path) for path in paths]) for paths in (learnt, held_out))
+    stage = SegmentationStage(network, known, others, config)
     make_folder(out)
-    told = f"{document.model_dump_json()}{config.model_dump_json()}{seed}{SEGMENTATION_NETWORK.model_dump_json()}"
     result = train(stage, config, seed, out, hashlib.sha256(told.encode()).hexdigest())
-    segmenter = Segmenter(stage._network)
+    if init is not None:
+        start = init.network.state_dict()
+        learned = network.state_dict().items()
+        network.load_state_dict({name: torch.lerp(start[name], weights, config.blend) for name, weights in learned})
+    segmenter = Segmenter(network)
     for name, data in segmenter.to_files().items():
         write_atomically(out / name, data)
     return segmenter, result

@@ -121,8 +121,8 @@ class Part:
 
     @property
     def confidence(self) -> float:
-        """That it moves in this way."""
-        return self.confidences[self.kind]
+        """That it moves, in whichever way."""
+        return sum(self.confidences.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +175,7 @@ class Segmenter:
     """Segments raw scans."""
 
     def __init__(self, network: SegmentationNetwork) -> None:
-        self._network = network
+        self.network = network
 
     def segment(self, points: Float, camera: Float, seed: int = 0, earlier: Evidence | None = None) -> Segmentation:
         """Find the object in a scan, and its movable parts.
@@ -216,12 +216,12 @@ class Segmenter:
     def _evaluated(self, given: SegmentationInput) -> tuple[Float32, Float32]:
         """Probabilities of the kinds, [N, kinds], and the middles that are voted for, [N, 3]."""
         clouds = CloudBatch.of([given.points], [group_cloud(given.points, SEGMENTATION_NETWORK)], [given.extra])
-        logits, offsets = self._network(clouds)
+        logits, offsets = self.network(clouds)
         return torch.softmax(logits[0], dim=-1).numpy(), given.points + offsets[0].numpy()
 
     def to_files(self) -> dict[str, bytes]:
         """The network as files, in half precision: weights.safetensors and segmentation.json."""
-        weights = save({name: tensor.half().contiguous() for name, tensor in self._network.state_dict().items()})
+        weights = save({name: tensor.half().contiguous() for name, tensor in self.network.state_dict().items()})
         document = SegmentationDocument(
             network=SEGMENTATION_NETWORK, weights_sha256=hashlib.sha256(weights).hexdigest()
         )

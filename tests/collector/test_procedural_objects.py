@@ -105,7 +105,7 @@ def test_each_part_moves_alone_and_opens_outward(objects: dict[str, ArticulatedO
             assert shift[0] > 0, "buttons and paddles go in"
 
 
-@pytest.mark.parametrize("object_id", [i for i in IDS if i.split("-")[0] not in {"switch", "faucet"}])
+@pytest.mark.parametrize("object_id", [i for i in IDS if i.split("-")[0] not in {"switch", "faucet", "swanfaucet"}])
 def test_parts_clear_the_body_and_each_other(objects: dict[str, ArticulatedObject], object_id: str) -> None:
     """Samples of one body's surface are never deep inside a convex piece of another, closed or half open."""
     described = objects[object_id]

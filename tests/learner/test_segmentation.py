@@ -40,15 +40,28 @@ def scenes(tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_a_training_lowers_the_loss_and_leaves_a_network(scenes: Path, tmp_path: Path) -> None:
     config = SegmentationConfig(steps=6, validate_every=3, batch_scenes=2)
-    _, result = train_segmentation(scenes, tmp_path / "out", config, 0)
+    _, result = train_segmentation([scenes], tmp_path / "out", config, 0)
     lines = [json.loads(line) for line in (tmp_path / "out" / METRICS_FILE).read_text().splitlines()]
     assert [line["step"] for line in lines] == [3, 6] and result.steps == 6
     assert lines[1]["score"] < lines[0]["score"]
     assert read_segmenter(tmp_path / "out").to_files().keys() == {"weights.safetensors", "segmentation.json"}
-    _, again = train_segmentation(scenes, tmp_path / "out", config, 0)
+    _, again = train_segmentation([scenes], tmp_path / "out", config, 0)
     assert again.steps == 6 and again.metrics == result.metrics
     with pytest.raises(UsageError, match="another"):
-        train_segmentation(scenes, tmp_path / "out", config, 1)
+        train_segmentation([scenes], tmp_path / "out", config, 1)
+
+
+def test_a_network_is_trained_on_from_another_and_blended_with_it(scenes: Path, tmp_path: Path) -> None:
+    told = ["train", "segmentation", "--scenes", str(scenes), str(scenes), "--steps", "1", "--out"]
+    again = ["--init", str(tmp_path / "start"), "--learning-rate", "0.5"]
+    assert adaafford([*told, str(tmp_path / "start"), "--seed", "3"]) == 0
+    assert adaafford([*told, str(tmp_path / "whole"), *again]) == 0
+    assert adaafford([*told, str(tmp_path / "part"), *again, "--blend", "0.25"]) == 0
+    start, whole, part = (
+        read_segmenter(tmp_path / name).network.state_dict()["output.weight"] for name in ("start", "whole", "part")
+    )
+    assert not torch.allclose(start, whole, atol=0.01)
+    assert torch.allclose(part, 0.75 * start + 0.25 * whole, atol=0.001)
 
 
 def test_a_mirrored_scene_has_mirrored_labels() -> None:

@@ -72,10 +72,12 @@ class TrainCommand(LearnerCommand):
 class SegmentationCommand:
     """Train the segmentation network from labelled scenes. Give the same command again to continue."""
 
-    scenes: Path
-    """Folder that `adaafford objects scenes` made."""
+    scenes: Annotated[tuple[Path, ...], Field(min_length=1)]
+    """Folders that `adaafford objects scenes` made."""
     out: OutFolder
     """Folder for the network, its metrics and its checkpoint: new, or of the same training."""
+    init: Path | None = None
+    """The --out of another training, whose network is the start."""
     settings: Annotated[SegmentationConfig, tyro.conf.arg(name="")] = SegmentationConfig()
     seed: Annotated[int, Field(ge=0)] = 0
     """Of all randomness."""
@@ -131,9 +133,11 @@ def main(args: list[str]) -> int:
 def _segmentation(command: SegmentationCommand) -> int:
     import torch
 
+    from adaafford.parts import read_segmenter
     from learner.stages.segmentation import train_segmentation
 
     if command.threads is not None:
         torch.set_num_threads(command.threads)
-    train_segmentation(command.scenes, command.out, command.settings, command.seed)
+    init = None if command.init is None else read_segmenter(command.init)
+    train_segmentation(command.scenes, command.out, command.settings, command.seed, init)
     return 0

@@ -22,6 +22,7 @@ from collector.objects.procedural.containers import (
 )
 from collector.objects.procedural.faucets import random_faucet
 from collector.objects.procedural.fitted import random_cabinet
+from collector.objects.procedural.mixed import random_flush_box, random_mixed_front, random_swan_faucet
 from collector.objects.procedural.openings import random_door, random_switch, random_window
 from collector.objects.procedural.shapes import normalised
 from collector.objects.writing import write_object
@@ -49,7 +50,14 @@ CATEGORIES: Mapping[str, Callable[[np.random.Generator], ObjectModel]] = {
     "Safe": random_safe,
 }
 """The paper's fifteen, called as PartNet-Mobility calls them."""
-EVERY_CATEGORY = {**CATEGORIES, "ButtonCabinet": random_button_cabinet, "HandleCabinet": random_handle_cabinet}
+EVERY_CATEGORY = {
+    **CATEGORIES,
+    "ButtonCabinet": random_button_cabinet,
+    "HandleCabinet": random_handle_cabinet,
+    "MixedFront": random_mixed_front,
+    "SwanFaucet": random_swan_faucet,
+    "FlushBox": random_flush_box,
+}
 """With those that are only made where a task or a command names them."""
 
 

@@ -39,7 +39,7 @@ Hinge = Literal["left", "right", "top"]
 
 
 @dataclass(frozen=True, slots=True)
-class _Style:
+class Style:
     """What all leaves of one unit have in common.
 
     Attributes:
@@ -80,7 +80,7 @@ def random_fitted_cabinet(rng: np.random.Generator) -> ObjectModel:
     width, height = float(rng.uniform(*sizes[:2])), float(rng.uniform(*sizes[2:]))
     depth = float(rng.uniform(0.28, 0.38) if kind == "wall" else rng.uniform(0.4, 0.6))
     opens = float(rng.uniform(1.4, 2.0))
-    style = _random_style(rng)
+    style = random_style(rng)
     carcass = Carcass(width, depth, height, WALL, style.thickness, 0.0, opens)
 
     half = width / 2
@@ -110,9 +110,9 @@ def random_fitted_cabinet(rng: np.random.Generator) -> ObjectModel:
     return ObjectModel("StorageFurniture", "furniture_body", body, tuple(parts))
 
 
-def _random_style(rng: np.random.Generator) -> _Style:
+def random_style(rng: np.random.Generator) -> Style:
     """Half of the fronts are flat; two in five have no handle."""
-    return _Style(
+    return Style(
         face=rng.choice(["flat", "raised", "recessed"], p=[0.5, 0.3, 0.2]),
         border=float(rng.uniform(0.04, 0.07)),
         relief=float(rng.uniform(0.005, 0.012)),
@@ -142,27 +142,27 @@ def _shell(width: float, depth: float, height: float, base: bool, rng: np.random
     return pieces
 
 
-def _leaf_part(leaf: _Leaf, style: _Style, opens: float, high_handle: bool) -> MovablePart:
+def _leaf_part(leaf: _Leaf, style: Style, opens: float, high_handle: bool) -> MovablePart:
     """A door or a flap, closed; its handle is in the corner of its free edge."""
     low: Point = (-CLEAR - style.thickness, leaf.y[0] + style.reveal, leaf.z[0] + style.reveal)
     high: Point = (-CLEAR, leaf.y[1] - style.reveal, leaf.z[1] - style.reveal)
-    pieces: Pieces = (block(low, high), *_relief(low, high, style))
+    pieces: Pieces = (block(low, high), *relief_on(low, high, style))
     face = low[0] - (style.relief if style.face == "recessed" else 0.0)
     inset = 0.5 * style.border
     middle = (low[1] + high[1]) / 2, (low[2] + high[2]) / 2
     if leaf.hinge == "top":
-        pieces += _handle((face, middle[0], low[2] + inset), LEFT, style, 0.3 * (high[1] - low[1]))
+        pieces += handle_on((face, middle[0], low[2] + inset), LEFT, style, 0.3 * (high[1] - low[1]))
         return hinged("tilt_door", pieces, (face, middle[0], high[2]), TOP, FRONT, opens)
     left = leaf.hinge == "left"
     length = min(0.2, 0.3 * (high[2] - low[2]))
     y = low[1] + inset if left else high[1] - inset
     z = high[2] - inset - length / 2 if high_handle else low[2] + inset + length / 2
-    pieces += _handle((face, y, z), TOP, style, length)
+    pieces += handle_on((face, y, z), TOP, style, length)
     corner = (face, high[1] if left else low[1], middle[1])
     return hinged("rotation_door", pieces, corner, LEFT if left else RIGHT, FRONT, opens)
 
 
-def _relief(low: Point, high: Point, style: _Style) -> Pieces:
+def relief_on(low: Point, high: Point, style: Style) -> Pieces:
     """What lies on the plate of a leaf from `low` to `high`: a raised panel, or the frame of a recessed one."""
     border = min(style.border, 0.25 * (high[1] - low[1]), 0.25 * (high[2] - low[2]))
     front = (low[0] - style.relief, low[1], low[2])
@@ -176,7 +176,8 @@ def _relief(low: Point, high: Point, style: _Style) -> Pieces:
             return ()
 
 
-def _handle(centre: Point, along: Point, style: _Style, length: float) -> Pieces:
+def handle_on(centre: Point, along: Point, style: Style, length: float) -> Pieces:
+    """A handle on a surface: `centre` is on it, and a bar is `length` long."""
     x, y, z = centre
     match style.handle:
         case "bar":
