@@ -182,7 +182,7 @@ class SegmentationConfig(TrainingConfig):
     batch_scenes: int = Field(4, ge=1)
     mirror: bool = True
     """Reflect half of the scenes."""
-    blend: float = Field(1.0, gt=0, le=1)
+    blend: float = Field(1.0, gt=0, le=1, exclude_if=lambda share: share == 1)
     """With --init: how far the weights go from the start to what was learned. Between the two lies a network that knows
     both kinds of scenes, and finds more on other objects than either (docs/learning.md)."""
 

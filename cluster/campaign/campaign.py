@@ -86,7 +86,7 @@ class Campaign:
             with worker_groups(config.workers, config.limits, config.ray_address) as make_worker_group:
                 self._worker_group = CurrentWorkerGroup(make_worker_group)
                 run_log.run({step.name: partial(self._do, step) for step in steps}, self._say)
-            from cluster.reporting.report import print_report
+            from cluster.reporting.printed import print_report
 
             print_report(run)
 

@@ -1,15 +1,12 @@
 """The report of a run: summary.json for programs, a table and a page for people, one picture."""
 
 import json
-import sys
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from cluster.config.campaign_config import CampaignConfig
 from cluster.evaluation.tables import RESULTS_FILE
@@ -22,14 +19,19 @@ from cluster.reporting.trial_sections import failures_section, first_trials, mos
 from cluster.runs.run_folder import RunFolder, read_json
 from cluster.runs.run_log import RunLog
 from shared.errors import UsageError
-from shared.formatting import terminal_table
 from shared.io.files import read_bounded, scratch_folder, write_atomically
-from shared.io.text import plain
 from shared.policies.adaptation import Adapter
 from shared.policies.policy import Policy
 from shared.software import software_versions
 from shared.store import Store
 from shared.types import OutcomeKind
+
+MAX_PICTURE_BYTES = 4 << 20
+MAX_FURTHER = 20
+"""Evaluations beside the run's own that are shown."""
+MOTION_EDGES = (0.0, 1e-4, 1e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0, float("inf"))
+"""Of the motion histogram, rad or length; 0.01 is the least that can be a success."""
+_COLUMNS = ("object_category", "proposer", "policy_version", "outcome", "motion", "success")
 
 
 def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, say: Callable[[str], None]) -> None:
@@ -95,22 +97,6 @@ def write_report(run: RunFolder, config: CampaignConfig, *, experiments: bool, s
     write_atomically(run.page, render(page).encode())
 
 
-def print_report(run: RunFolder) -> None:
-    """Print the table of a run that was reported, and where its files are.
-
-    Raises:
-        UsageError: the run has no report yet.
-    """
-    if not run.summary.is_file():
-        raise UsageError(f"{run.path}: has no report yet; finish the run with `adaafford resume {run.path}`")
-    summary = read_json(run.summary)
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
-    console.print(_results_table(summary))
-    console.print(_rates_table(summary))
-    for line in _lines(summary, run):
-        console.print(plain(line), markup=False, soft_wrap=True)
-
-
 def _rows(run: RunFolder) -> list[dict[str, Any]]:
     rows = read_json(run.training("evaluate") / RESULTS_FILE)["rows"]
     assert isinstance(rows, list)
@@ -129,51 +115,6 @@ def _speed(run_log: RunLog) -> float | None:
     interactions = sum(tally["interactions"] for tally in tallies)
     seconds = sum(tally["seconds"].get("total", 0.0) for tally in tallies)
     return round(interactions / seconds, 2) if seconds > 0 else None
-
-
-def _results_table(summary: dict[str, Any]) -> Table:
-    figures = ("f_score", "sample_success", "start_success", "trials", "best_f", "bce", "auc", "base_rate")
-    names = ("method", "budget", *figures)
-    rows = ([row.get(name) for name in names] for row in summary["rows"])
-    title = f"{summary['task']}: objects not seen in training"
-    return terminal_table(title, [name.replace("_", " ") for name in names], rows)
-
-
-def _rates_table(summary: dict[str, Any]) -> Table:
-    names = ("interactions", "successes", "success_rate")
-    rates = summary["random_success_by_category"].items()
-    rows = ([category, *(rate[name] for name in names)] for category, rate in rates)
-    head = ["category", *(name.replace("_", " ") for name in names)]
-    return terminal_table("random interactions, by category", head, rows)
-
-
-def _lines(summary: dict[str, Any], run: RunFolder) -> list[str]:
-    objects = summary["objects"]
-    stages = ", ".join(f"{name} {seconds:g}" for name, seconds in summary["stage_seconds"].items())
-    motions = ", ".join(
-        f"{bin_['low']:g}+ {bin_['count']}" for bin_ in summary["random_motion_histogram"] if bin_["count"]
-    )
-    outcomes = ", ".join(f"{name} {each['share']:.1%}" for name, each in summary["outcomes"].items())
-    speed = summary["interactions_per_core_second"]
-    return [
-        f"objects       {len(objects['train'])} train, {len(objects['validation'])} validation, "
-        f"{len(objects['test'])} test, {len(objects['refused'])} refused (reasons in {run.objects_file.name})",
-        f"interactions  {summary['interactions']}, {'unknown' if speed is None else speed} a core-second; "
-        f"policy versions {', '.join(map(str, summary['policy_versions']))}",
-        f"outcomes      {outcomes}",
-        f"motions       {motions}",
-        f"seconds       {stages}; in all {summary['wall_seconds']:g}",
-        f"files         {_shown(run.summary)}  {_shown(run.picture)}  {_shown(run.page)}  {_shown(run.store)}",
-    ]
-
-
-def _shown(path: Path) -> str:
-    return str(path) if path.exists() else f"(no {path.name})"
-
-
-MOTION_EDGES = (0.0, 1e-4, 1e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0, 3.0, float("inf"))
-"""Of the motion histogram, rad or length; 0.01 is the least that can be a success."""
-_COLUMNS = ("object_category", "proposer", "policy_version", "outcome", "motion", "success")
 
 
 def collection_figures(store: Store) -> dict[str, Any]:
@@ -214,11 +155,6 @@ def _histogram(motions: list[float]) -> list[dict[str, Any]]:
         {"low": low, "high": high, "count": int(count)}
         for low, high, count in zip(MOTION_EDGES[:-1], highs, counts, strict=True)
     ]
-
-
-MAX_PICTURE_BYTES = 4 << 20
-MAX_FURTHER = 20
-"""Evaluations beside the run's own that are shown."""
 
 
 def _further(run: RunFolder) -> list[tuple[str, Results]]:

@@ -79,13 +79,15 @@ class AipProposer:
         """The next action, or None to stop."""
         if len(history) >= self.budget:
             return None
-        candidates = self.candidates(observation, history)
+        candidates = movable_points(observation)
+        preferred = self.preferred(observation.points[candidates].astype(np.float64), history)
         latent = self.adapter.z(history)
         information = self.adapter.information(observation, candidates, latent)
-        if len(history) >= self.at_least and float(information.max()) < self.threshold:
+        if len(history) >= self.at_least and float(information[preferred].max()) < self.threshold:
             return None
 
         def choose(left: NDArray[np.int64]) -> int:
+            left = left[preferred[left]] if preferred[left].any() else left
             if self.share is None:
                 return int(left[information[left].argmax()])
             return drawn_point(left, information[left], points_of(self.share, observation), self.rng)
@@ -96,9 +98,9 @@ class AipProposer:
 
         return reachable_action(observation, candidates, choose, act)
 
-    def candidates(self, observation: Observation, history: Sequence[Interaction]) -> NDArray[np.int64]:
-        """Indices of the points that it chooses among, [C]."""
-        return movable_points(observation)
+    def preferred(self, points: Float, history: Sequence[Interaction]) -> NDArray[np.bool_]:
+        """Which of the points, [C, 3], it chooses among, [C]; among others only where the arm reaches none of these."""
+        return np.ones(len(points), np.bool_)
 
 
 class SpreadAipProposer(AipProposer):
@@ -110,12 +112,10 @@ class SpreadAipProposer(AipProposer):
 
     name = "aip-spread"
 
-    def candidates(self, observation: Observation, history: Sequence[Interaction]) -> NDArray[np.int64]:
-        """Indices of the furthest half of the movable points, [C]."""
-        movable = movable_points(observation)
-        tried = np.array([each.action.point for each in history]).reshape(-1, 3)
-        spread = distances_to(observation.points[movable].astype(np.float64), tried)
-        return movable if spread is None else movable[spread >= np.median(spread)]
+    def preferred(self, points: Float, history: Sequence[Interaction]) -> NDArray[np.bool_]:
+        """The furthest half of the points, [C]."""
+        spread = distances_to(points, np.array([each.action.point for each in history]).reshape(-1, 3))
+        return super().preferred(points, history) if spread is None else spread >= np.median(spread)
 
 
 def _aip(proposer: type[AipProposer]) -> ProposerKind:

@@ -121,7 +121,7 @@ class Part:
 
     @property
     def confidence(self) -> float:
-        """That it moves, in whichever way."""
+        """That it moves in one of the ways in `confidences`."""
         return sum(self.confidences.values())
 
 

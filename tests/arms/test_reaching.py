@@ -31,7 +31,7 @@ from shared.errors import StoreError, UsageError
 from shared.geometry import camera_pose, gripper_rotation
 from shared.plan import Job, Plan, Setting
 from shared.policies.adaptation import Adapter
-from shared.policies.proposers import proposer_named
+from shared.policies.proposers import SpreadAipProposer, proposer_named
 from shared.primitives import PRIMITIVES
 from shared.store import Store
 from shared.store.codecs.columns import ROLLOUT_COLUMNS, RolloutRow
@@ -40,7 +40,7 @@ from shared.store.layout import ARM_VERSION
 from shared.store.validity import check_rollouts
 from shared.store.writer import rollout_digest
 from shared.tasks import Task, task_named
-from shared.types import Action, HiddenDynamics, Observation, OutcomeKind
+from shared.types import Action, HiddenDynamics, Interaction, Observation, Outcome, OutcomeKind
 from tests.adaafford.test_adapt_command import front
 from tests.collector.test_determinism import ROLLOUTS, collected
 from tests.support.arms import urdf_of
@@ -110,6 +110,27 @@ def test_none_of_a_thousand_proposals_is_out_of_reach(arm: str) -> None:
     for k in range(1000):
         name = PROPOSERS[k % 2 * 6]
         assert reached(armed, proposer_named(name, adapter, rng, 4, 0.2 if name == "aip" else None).propose(armed, []))
+
+
+def test_aip_goes_near_an_earlier_interaction_where_the_arm_reaches_nothing_far(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen, adapter = cabinet(), Adapter(policy_with_all())
+    first = SpreadAipProposer(adapter, np.random.default_rng(1), 4).propose(seen, [])
+    assert first is not None
+    near = np.linalg.norm(seen.points - first.point, axis=1) < 0.1
+
+    class NearTheFirst:
+        def trajectory(self, action: Action) -> np.ndarray | None:
+            return np.zeros((1, 1)) if near[action.point_index] else None
+
+    monkeypatch.setattr("shared.policies.adaptation.reachable_points", lambda observation: near)
+    armed = dataclasses.replace(seen, reach=NearTheFirst())
+    history = [Interaction(armed, first, Outcome(OutcomeKind.OK, 0.0, False))]
+    far = SpreadAipProposer(adapter, np.random.default_rng(1), 4, at_least=4).propose(seen, history)
+    assert far is not None
+    assert not near[far.point_index]
+    assert reached(armed, SpreadAipProposer(adapter, np.random.default_rng(1), 4, at_least=4).propose(armed, history))
 
 
 def test_an_arm_that_reaches_everything_changes_no_choice() -> None:

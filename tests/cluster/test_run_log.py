@@ -170,6 +170,6 @@ def test_a_run_that_goes_on_removes_what_killed_workers_left_in_a_store_that_is_
     subprocess.run([sys.executable, "-c", code, str(run.store)], check=True)
     assert len(list((run.store / "underway").iterdir())) == 2
     monkeypatch.setattr(RunLog, "run", lambda *_: None)
-    monkeypatch.setattr("cluster.reporting.report.print_report", lambda _: None)
+    monkeypatch.setattr("cluster.reporting.printed.print_report", lambda _: None)
     Campaign(*find(run.path)).execute()
     assert list((run.store / "underway").iterdir()) == []

@@ -41,7 +41,7 @@ def main(args: list[str]) -> int:
     if command.store is None:
         if is_training(command.run):
             raise UsageError(
-                f"{command.run}: the folder of a training and not of a run; add --store, the store of its interactions"
+                f"{command.run}: has a policy and no run; add --store, the store of the interactions it was trained on"
             )
         source = source_of_run(find(command.run)[0], command.policy)
     else:

@@ -23,12 +23,14 @@ class ReportCommand:
 def main(args: list[str]) -> int:
     """Report."""
     command = parse_flags(ReportCommand, args, "report")
-    from cluster.reporting.report import print_report, write_report
+    from cluster.reporting.printed import print_report
     from cluster.runs.run_folder import find
     from cluster.runs.run_log import RunLog
 
     run, config = find(command.run)
     if "evaluate" in RunLog(run.log).finished:
+        from cluster.reporting.report import write_report
+
         write_report(run, config, experiments=command.experiments, say=_say)
     print_report(run)
     return 0

@@ -138,6 +138,10 @@ def _segmentation(command: SegmentationCommand) -> int:
 
     if command.threads is not None:
         torch.set_num_threads(command.threads)
+    if command.init is None and command.settings.blend != 1:
+        raise UsageError(
+            f"--blend {command.settings.blend:g}: say between what by --init, the --out of another training"
+        )
     init = None if command.init is None else read_segmenter(command.init)
     train_segmentation(command.scenes, command.out, command.settings, command.seed, init)
     return 0
