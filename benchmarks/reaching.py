@@ -22,7 +22,7 @@ from collector.objects.articulation import surface_at
 from collector.objects.catalogue import ObjectCache
 from collector.random_proposer import RandomProposer
 from collector.rollout import Start, begin, object_of
-from collector.sim.environment import ArmedEnvironment
+from collector.sim.armed import ArmedEnvironment
 from collector.sim.simulator import StageClock
 from shared.arms.arm import Arm
 from shared.arms.kinematics import MAX_JOINT_STEP, ArmReach, chain_of, reachable_points

@@ -13,7 +13,7 @@ import numpy as np
 from collector.method_trials import ProposerFactory, evaluate
 from collector.objects.articulation import ArticulatedObject, surface_at
 from collector.random_proposer import RandomProposer
-from collector.sim.environment import ArmedEnvironment
+from collector.sim.armed import ArmedEnvironment
 from collector.sim.simulator import SIMULATORS, SimEnvironment, StageClock
 from shared import seeds
 from shared.config import DynamicsRanges, Range

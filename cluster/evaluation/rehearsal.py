@@ -20,8 +20,9 @@ from adaafford.scans import Scan, ScanFrame, action_at, npz_of
 from adaafford.sessions import ReachError, Request, Session, Step
 from collector.objects.articulation import Body
 from collector.scenes import draw_surroundings, extent, raw_scan
+from collector.sim.armed import ArmedEnvironment
 from collector.sim.camera import noisy
-from collector.sim.environment import ArmedEnvironment, camera_for
+from collector.sim.environment import camera_for
 from collector.sim.simulator import SimEnvironment
 from shared import seeds
 from shared.config import CameraConfig, StrictModel

@@ -20,7 +20,7 @@ from collector.objects.catalogue import load_ref, scan
 from collector.objects.procedural.catalogue import generate
 from collector.rollout import draw_arm_base
 from collector.setting import make_setting
-from collector.sim.environment import ArmedEnvironment
+from collector.sim.armed import ArmedEnvironment
 from collector.sim.restoration import restored
 from collector.sim.simulator import StageClock
 from collector.worker import Worker

@@ -1,5 +1,7 @@
 """Rollouts come out the same whoever runs them, and hold what a replay needs."""
 
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -442,3 +444,9 @@ def test_a_setting_means_the_same_whether_it_was_resolved_or_not(objects: Path) 
         for plan in (plan_for(objects, "pull"), plan_for(objects, "pull", collection=task_named("pull").resolve(SMALL)))
     ]
     assert points[0] == points[1]
+
+
+def test_no_simulator_is_imported_before_one_is_chosen() -> None:
+    script = "import sys, collector.rollout; print(sorted({'sapien', 'coacd', 'embreex'} & sys.modules.keys()))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

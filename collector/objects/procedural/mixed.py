@@ -57,10 +57,8 @@ def random_mixed_front(rng: np.random.Generator) -> ObjectModel:
     if kind == "table" and rng.random() < 0.3:
         height *= 2.5
     cells = _cells(kind, width, height, rng)
-    style, gap = (
-        random_style(rng),
-        float(rng.uniform(0.0003, 0.0012) if rng.random() < 0.5 else rng.uniform(0.002, 0.008)),
-    )
+    style = random_style(rng)
+    gap = float(rng.uniform(0.0003, 0.0012) if rng.random() < 0.5 else rng.uniform(0.002, 0.008))
     wall = min(float(rng.uniform(0.008, 0.03)), *(0.2 * (span[1] - span[0]) for cell in cells for span in cell[:2]))
     frame = wall if rng.random() < 0.5 else wall + float(rng.uniform(0.01, 0.05)) * min(1.0, 3 * height)
     face = float(rng.choice([-gap - style.thickness, 0.0, rng.uniform(0.004, 0.03)], p=[0.5, 0.2, 0.3]))
